@@ -1,0 +1,129 @@
+"""Obstacles: small values that yield static pymunk shapes. They collide and cut beams.
+
+A user adds one by writing a class with a ``shapes`` method.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Protocol, runtime_checkable
+
+import pymunk
+from pydantic import AfterValidator, Field
+
+from shepherd_phys.settings import Settings, SettingsError, kind_of, settings
+
+Point = tuple[float, float]
+"""(x, y) [m]."""
+
+MIN_THICKNESS = 0.1
+"""[m]. At the default substep nothing gets through a wall this thick; thinner ones are refused."""
+
+
+@runtime_checkable
+class Obstacle(Protocol):
+    """Something solid that does not move."""
+
+    def shapes(self, body: pymunk.Body) -> list[pymunk.Shape]:
+        """Fresh shapes attached to ``body``, the world's static one, in world coordinates [m]."""
+        ...
+
+
+@settings
+class Wall(Settings):
+    """A straight wall with round ends."""
+
+    start: Point
+    end: Point
+    """Ends of its centre line [m]."""
+    thickness: float = Field(default=0.1, ge=MIN_THICKNESS)
+    """[m]"""
+
+    def __post_init__(self) -> None:
+        if math.dist(self.start, self.end) == 0:
+            raise ValueError("start and end are the same point; use a Pillar")
+
+    def shapes(self, body: pymunk.Body) -> list[pymunk.Shape]:
+        """One segment."""
+        return [pymunk.Segment(body, self.start, self.end, self.thickness / 2)]
+
+
+@settings
+class Pillar(Settings):
+    """A disc."""
+
+    center: Point
+    """[m]"""
+    radius: float = Field(default=0.5, ge=MIN_THICKNESS / 2)
+    """[m]"""
+
+    def shapes(self, body: pymunk.Body) -> list[pymunk.Shape]:
+        """One circle."""
+        return [pymunk.Circle(body, self.radius, self.center)]
+
+
+def _convex(vertices: tuple[Point, ...]) -> tuple[Point, ...]:
+    """Counter-clockwise corners of a convex polygon that is thick enough, or an error."""
+    n = len(vertices)
+    turns = []
+    for i in range(n):
+        (ax, ay), (bx, by), (cx, cy) = vertices[i - 1], vertices[i], vertices[(i + 1) % n]
+        turns.append((bx - ax) * (cy - by) - (by - ay) * (cx - bx))
+    if not (all(t > 0 for t in turns) or all(t < 0 for t in turns)):
+        raise ValueError("the corners must go once round a convex polygon, no three in a line")
+    ordered = vertices if turns[0] > 0 else vertices[::-1]
+    total = 0.0  # turning angle: a pentagram turns left at every corner, too, but twice round
+    for i in range(n):
+        (ax, ay), (bx, by), (cx, cy) = ordered[i - 1], ordered[i], ordered[(i + 1) % n]
+        total += math.atan2(
+            (bx - ax) * (cy - by) - (by - ay) * (cx - bx), (bx - ax) * (cx - bx) + (by - ay) * (cy - by)
+        )
+    if total > 2.5 * math.pi:
+        raise ValueError("the corners must go once round a convex polygon")
+    width = math.inf
+    for i in range(n):
+        (ax, ay), (bx, by) = ordered[i - 1], ordered[i]
+        nx, ny = (ay - by), (bx - ax)
+        length = math.hypot(nx, ny)
+        width = min(width, max((x - ax) * nx + (y - ay) * ny for x, y in ordered) / length)
+    if width < MIN_THICKNESS:
+        raise ValueError(f"is {width:.3g} m thick at its thinnest; at least {MIN_THICKNESS} m is allowed")
+    return ordered
+
+
+@settings
+class Polygon(Settings):
+    """A convex polygon."""
+
+    vertices: Annotated[tuple[Point, ...], Field(min_length=3), AfterValidator(_convex)]
+    """Corners in order [m]; kept counter-clockwise."""
+
+    def shapes(self, body: pymunk.Body) -> list[pymunk.Shape]:
+        """One polygon."""
+        return [pymunk.Poly(body, list(self.vertices))]
+
+
+OBSTACLES: dict[str, type[Any]] = {"Wall": Wall, "Pillar": Pillar, "Polygon": Polygon}
+"""The library's obstacles by name, for files."""
+
+
+def solid(obstacle: Obstacle, index: int, body: pymunk.Body) -> list[pymunk.Shape]:
+    """An obstacle's shapes, checked.
+
+    Raises:
+        SettingsError: names the obstacle and what it lacks.
+    """
+    name = f"obstacles[{index}] ({kind_of(obstacle)})"
+    if not hasattr(obstacle, "shapes"):
+        raise SettingsError(f"{name}: an obstacle needs 'shapes'; see shepherd_phys.obstacles.Obstacle")
+    shapes = list(obstacle.shapes(body))
+    if not shapes:
+        raise SettingsError(f"{name}.shapes: gave no shape")
+    for shape in shapes:
+        if shape.body is not body:
+            raise SettingsError(f"{name}.shapes: {type(shape).__name__} is not attached to the body it was given")
+        box = shape.cache_bb()
+        if not all(map(math.isfinite, (box.left, box.bottom, box.right, box.top))):
+            raise SettingsError(f"{name}.shapes: {type(shape).__name__} is not finite")
+        shape.friction = 0.0
+    return shapes

@@ -1,0 +1,214 @@
+"""How settings are declared, varied, written to TOML and read back.
+
+Every setting of the library is a frozen, validated value beside the code that it governs. This module
+holds what they share: the decorator, ``but``, and the two directions of plain data (TOML tables).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import tomllib
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any, Self, TypeVar, cast, dataclass_transform
+
+import pydantic
+import tomli_w
+from pydantic import ConfigDict
+
+T = TypeVar("T")
+
+
+class SettingsError(ValueError):
+    """A setting is unknown or impossible; the message names the field, the value and what is allowed."""
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field, pydantic.Field))
+def settings(cls: type[T]) -> type[T]:
+    """Make a class a settings value: frozen, each field validated, unknown fields an error.
+
+    NaN and infinities are refused in every float field.
+    """
+    config = ConfigDict(
+        extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True, validate_default=True
+    )
+    decorated = pydantic.dataclasses.dataclass(frozen=True, config=config)(cls)
+    validating_init = decorated.__init__
+
+    def __init__(self: Any, *args: Any, **values: Any) -> None:
+        try:
+            validating_init(self, *args, **values)
+        except pydantic.ValidationError as error:
+            raise SettingsError(_explain(cls, error)) from None
+        except TypeError as error:
+            raise SettingsError(f"{cls.__name__}: {error}") from None
+
+    __init__.__signature__ = inspect.signature(validating_init)  # type: ignore[attr-defined]
+    __init__.__doc__ = validating_init.__doc__
+    decorated.__init__ = __init__  # type: ignore[method-assign]
+    return cast("type[T]", decorated)
+
+
+def _explain(cls: type[Any], error: pydantic.ValidationError) -> str:
+    """One line for every field that is wrong: where, what was given, what is allowed."""
+    names = [f.name for f in dataclasses.fields(cls)]
+    lines = []
+    for problem in error.errors(include_url=False):
+        path = list(problem["loc"])
+        if path and isinstance(path[0], int) and path[0] < len(names):
+            path[0] = names[path[0]]  # a positional argument: say which field it fills
+        where = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in path)
+        message = problem["msg"].removeprefix("Value error, ")
+        if problem["type"] == "unexpected_keyword_argument":
+            message = f"there is no such field; fields are {', '.join(names)}"
+        whole = not path or problem["type"] == "missing"
+        lines.append(f"{cls.__name__}{where}: {message}" + ("" if whole else f" (given: {_brief(problem['input'])})"))
+    return "; ".join(lines)
+
+
+def _brief(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 80 else text[:77] + "..."
+
+
+class Settings:
+    """Mixin of every settings class: ``but`` for a validated copy, ``to_dict`` for plain data."""
+
+    def but(self, **changes: Any) -> Self:
+        """A validated copy with ``changes``.
+
+        Raises:
+            SettingsError: a field is unknown or its value impossible.
+        """
+        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}  # type: ignore[arg-type]
+        unknown = [name for name in changes if name not in fields]
+        if unknown:
+            raise SettingsError(
+                f"{type(self).__name__}.{unknown[0]}: there is no such field "
+                f"(given: {_brief(changes[unknown[0]])}); fields are {', '.join(fields)}"
+            )
+        return type(self)(**{**fields, **changes})
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data (numbers, text, lists, tables) from which ``from_dict`` makes an equal value."""
+        return {
+            f.name: _plain(getattr(self, f.name))
+            for f in dataclasses.fields(self)  # type: ignore[arg-type]
+            if getattr(self, f.name) is not None
+        }
+
+
+@dataclasses.dataclass(frozen=True)
+class Foreign:
+    """An object of a user's own class, read from a file: its name stays text, nothing is imported.
+
+    It can be looked at and written back. Whoever needs the object itself hands the class over
+    (``classes=`` of the reading function); until then, using it is an error that says so.
+    """
+
+    kind: str
+    values: Mapping[str, Any]
+
+    def __hash__(self) -> int:
+        return hash(self.kind)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The table that was read."""
+        return {**self.values}
+
+    def missing(self) -> SettingsError:
+        """The error to raise where the object itself is needed."""
+        return SettingsError(
+            f"{self.kind!r} is a class of somebody's own and was not handed over: "
+            "pass it in (classes= in Python, module:Name on the command line)"
+        )
+
+
+def kind_of(value: object) -> str:
+    """The name under which an object is written: its class's name, ``module:Name`` outside the library."""
+    if isinstance(value, Foreign):
+        return value.kind
+    cls = value if inspect.isclass(value) or inspect.isroutine(value) else type(value)
+    module = cls.__module__
+    if module.split(".")[0] == "shepherd_phys":
+        return str(cls.__name__)
+    return f"{module}:{cls.__qualname__}"
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Settings):
+        return value.to_dict()
+    if isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, tuple | list):
+        return [_plain(item) for item in value]
+    return tagged(value)
+
+
+def tagged(value: Any) -> dict[str, Any]:
+    """An object as a table that also says of which kind it is."""
+    if isinstance(value, Settings | Foreign):
+        return {"kind": kind_of(value), **value.to_dict()}
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
+        return {"kind": kind_of(value), **{k: _plain(v) for k, v in fields.items() if v is not None}}
+    return {"kind": kind_of(value)}
+
+
+def untagged(table: Mapping[str, Any], known: Mapping[str, Callable[..., Any]], where: str) -> Any:
+    """The object that ``tagged`` described.
+
+    Args:
+        table: the table, with its ``kind``.
+        known: kind -> class, the library's and those handed over.
+        where: name of the field, for the error.
+
+    Returns:
+        the object; a `Foreign` where the kind is ``module:Name`` and was not handed over.
+
+    Raises:
+        SettingsError: no kind, or an unknown one.
+    """
+    if not isinstance(table, Mapping) or not isinstance(table.get("kind"), str):
+        raise SettingsError(f"{where}: needs a table with a kind (given: {_brief(table)})")
+    values = {key: value for key, value in table.items() if key != "kind"}
+    kind = table["kind"]
+    if kind in known:
+        made = known[kind]
+        if inspect.isroutine(made):  # a plain function needs no making
+            return made
+        try:
+            return made(**values)
+        except TypeError as error:
+            raise SettingsError(f"{where}: {kind}: {error}") from None
+    if ":" in kind:
+        return Foreign(kind, values)
+    raise SettingsError(f"{where}.kind: unknown kind {kind!r}; known: {', '.join(sorted(known))}")
+
+
+def handed_over(classes: Iterable[Any]) -> dict[str, Any]:
+    """A user's own classes by the names under which they are written."""
+    return {kind_of(cls): cls for cls in classes}
+
+
+def write_toml(table: Mapping[str, Any], path: str | Path) -> None:
+    """Write plain data as TOML; the file appears whole or not at all."""
+    path = Path(path)
+    temporary = path.with_name(path.name + ".part")
+    temporary.write_bytes(tomli_w.dumps(table).encode())
+    temporary.replace(path)
+
+
+def read_toml(path: str | Path) -> dict[str, Any]:
+    """Read a TOML file.
+
+    Raises:
+        SettingsError: the file is missing or is not TOML; the message names it.
+    """
+    try:
+        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise SettingsError(f"{path}: cannot be read ({error.strerror})") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise SettingsError(f"{path}: is not a TOML file ({error})") from None

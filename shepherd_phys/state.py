@@ -1,0 +1,101 @@
+"""`WorldState`: one frozen reading of the world, which everything else reads; and measures of a flock."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shepherd_phys.obstacles import Obstacle
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WorldState:
+    """What the world is at the end of a control step.
+
+    The arrays are read-only and belong to this state alone. N sheep, P shepherds; metres, seconds, radians.
+    """
+
+    step: int
+    """Control steps since reset."""
+    time: float
+    """Seconds since reset."""
+    goal_pos: Floats
+    """(2,) centre g of the goal disc [m]."""
+    goal_radius: float
+    """R [m]."""
+    sheep_pos: Floats
+    """(N, 2) centres A_i [m]."""
+    sheep_vel: Floats
+    """(N, 2) velocities as the bodies have them [m/s]."""
+    sheep_heading: Floats
+    """(N, 2) unit vectors H_i: the last commanded directions."""
+    sheep_goal_distance: Floats
+    """(N,) distance of each centre to the goal's border [m], 0 inside."""
+    sheep_in_goal: Bools
+    """(N,) whether the centre lies in the goal now: |A_i - g| <= R."""
+    sheep_arrived: Bools
+    """(N,) whether the sheep has ever been in the goal; the others are wild."""
+    sheep_radius: Floats
+    """(N,) radius of the disc round each centre that holds its body [m]."""
+    sheep_max_speed: Floats
+    """(N,) speed of a moving sheep [m/s]."""
+    shepherd_pos: Floats
+    """(P, 2) [m]."""
+    shepherd_vel: Floats
+    """(P, 2) [m/s]."""
+    shepherd_angle: Floats
+    """(P,) orientation of the body [rad]; 0 for a disc."""
+    shepherd_radius: Floats
+    """(P,) radius of the disc round each centre that holds its body [m]."""
+    shepherd_max_speed: Floats
+    """(P,) [m/s]."""
+    shepherd_path: Floats
+    """(P,) length walked since reset [m]: summed displacement over control steps."""
+    collisions: int
+    """New contacts of a shepherd with an obstacle or another shepherd since reset, over the team."""
+    obstacles: tuple[Obstacle, ...]
+    """The solid things of this episode."""
+
+    @property
+    def n_sheep(self) -> int:
+        """N."""
+        return len(self.sheep_pos)
+
+    @property
+    def n_shepherds(self) -> int:
+        """P."""
+        return len(self.shepherd_pos)
+
+    def but(self, **changes: Any) -> WorldState:
+        """A copy with some fields changed; arrays are copied and made read-only."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        for name, value in changes.items():
+            if name not in values:
+                raise TypeError(f"WorldState has no field {name!r}")
+            if isinstance(values[name], np.ndarray):
+                value = frozen(np.array(value, dtype=values[name].dtype))
+            values[name] = value
+        return WorldState(**values)
+
+
+def frozen(array: NDArray[Any]) -> NDArray[Any]:
+    """The same array, read-only from now on."""
+    array.flags.writeable = False
+    return array
+
+
+def centroid(points: Floats) -> Floats:
+    """Mean position, Strömbom's GCM when given the whole flock: (K, 2) -> (2,)."""
+    return np.asarray(points.mean(axis=0))
+
+
+def unit(vectors: Floats) -> Floats:
+    """Vectors (..., 2) scaled to length 1; a vector of length 0 stays 0."""
+    length = np.hypot(vectors[..., 0], vectors[..., 1])[..., None]
+    return np.divide(vectors, length, out=np.zeros_like(vectors, dtype=float), where=length > 0)
