@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -61,6 +62,8 @@ class WorldState:
     """New contacts of a shepherd with an obstacle or another shepherd since reset, over the team."""
     obstacles: tuple[Obstacle, ...]
     """The solid things of this episode."""
+    control_dt: float = 0.2
+    """Length of a control step [s]."""
 
     @property
     def n_sheep(self) -> int:
@@ -99,3 +102,38 @@ def unit(vectors: Floats) -> Floats:
     """Vectors (..., 2) scaled to length 1; a vector of length 0 stays 0."""
     length = np.hypot(vectors[..., 0], vectors[..., 1])[..., None]
     return np.divide(vectors, length, out=np.zeros_like(vectors, dtype=float), where=length > 0)
+
+
+@numba.njit(cache=True)
+def sub_flocks(points, link):  # type: ignore[no-untyped-def]
+    """Single linkage: sheep less than ``link`` apart, directly or over others, share a label.
+
+    Args:
+        points: (K, 2) positions [m].
+        link: [m].
+
+    Returns:
+        (K,) labels 0, 1, .. in the order of each sub-flock's first member.
+    """
+    n = len(points)
+    label = np.full(n, -1, np.int64)
+    waiting = np.empty(n, np.int64)
+    count = 0
+    for first in range(n):
+        if label[first] >= 0:
+            continue
+        label[first] = count
+        waiting[0] = first
+        size = 1
+        while size > 0:
+            size -= 1
+            i = waiting[size]
+            for j in range(n):
+                if label[j] < 0:
+                    dx, dy = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1]
+                    if dx * dx + dy * dy < link * link:
+                        label[j] = count
+                        waiting[size] = j
+                        size += 1
+        count += 1
+    return label

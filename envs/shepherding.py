@@ -1,0 +1,272 @@
+"""`ShepherdingEnv`, registered as ``Shepherding-v0``: the Gymnasium environment of one team."""
+
+from __future__ import annotations
+
+from collections import deque
+from pathlib import Path
+from typing import Any, Literal, SupportsFloat
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from shepherd_phys.lidar import CHANNELS, Lidar, Scan, Stack, encode
+from shepherd_phys.scenario import Scenario, load_scenario
+from shepherd_phys.settings import SettingsError
+from shepherd_phys.state import Floats, WorldState
+from shepherd_phys.world import SHEEP_SETS, World
+
+from .rewards import SCHEMES, Scheme
+
+SUCCESS_FRACTION = 0.95
+"""An episode succeeds with this fraction of the sheep in the goal."""
+SUCCESS_SECONDS = 5.0
+"""With ``terminate_on_success`` it ends when that held for so long [s]."""
+TRAIL_STEPS = 150
+"""Control steps of the shepherds' trails in a picture."""
+
+
+class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
+    """A team of shepherds brings flocks of sheep to a goal region.
+
+    ## Description
+
+    Sheep are discs in a 2-D physics engine; they graze until a shepherd comes within 10 m and then move by the rules of
+    Strombom et al. (2014). P shepherds see them by lidar only. One env is one team: an observation row and an
+    action row a shepherd, one reward for all. The world is that of "Perception-Based Rewards for Robotic Shepherd
+    Teams Maneuvering Split Flocks"; everything about it is set by a `shepherd_phys.scenario.Scenario`.
+
+    ## Action space
+
+    ``Box(-1, 1, (P, 2), float32)``: the wanted velocity of each shepherd over its top speed, world axes (x right,
+    y up). Longer than 1 is clipped to the unit disc. It is held for one control step (0.2 s).
+
+    ## Observation space
+
+    ``Box(0, 1, (P, stack x channels, beams), float32)``, by default ``(3, 9, 512)``: the last 3 lidar frames of each
+    shepherd, row = frame x channels + channel, newest frame last.
+
+    | channel | reads | range |
+    |---|---|---|
+    | sheep | the nearest sheep along the beam | 50 m |
+    | shepherds | the nearest other shepherd | 50 m |
+    | goal | the goal's border (from inside: the way out) | 75 m |
+    | obstacles (where the scenario has some) | the nearest obstacle; it also cuts the other channels | 50 m |
+
+    Beam k points at 2 pi k / 512 from the x axis. A value is 1 - distance / range, 0 where nothing is seen. Fewer
+    sectors, the goal frame and the paper's 1536 x 1 x 3 arrangement are settings of `shepherd_phys.lidar.Lidar`. In the
+    goal frame observations are rolled by ``beam_offset`` (P,) beams; actions stay in world axes.
+
+    ## Rewards
+
+    One number for the team: the sum of weight x term over the scheme. N sheep, T nominal steps.
+
+    | name | weight | term | range of the weighted term over an episode |
+    |---|---|---|---|
+    | occupy | 10 | sheep in the goal / (N T) | 0 .. 10 |
+    | distance | -0.1 | sum over sheep outside of (1 + d) / (N T), d to the border [m] | about -2 .. 0 |
+    | occlude | 0.1 | beams with a sheep of S in front of the goal, 2 m to 10 m away / (P T) | 0 .. about 5 |
+
+    Schemes: ``original`` (no occlude), ``any`` (S = all sheep), ``wild`` (S = sheep that have never been in the goal).
+    Your own: any mapping name -> (weight, term), see `shepherd_phys.envs.rewards`.
+
+    ## Starting state
+
+    Goal and shepherds are uniform in a 50 m box; each flock's centre lies at a uniform bearing, 10-20 m from the goal's.
+    ``reset(seed=s)`` replays an episode exactly.
+
+    ## End of an episode
+
+    Truncated by the env itself after T = 1000 steps (do not add a TimeLimit). Terminated only with the
+    scenario's ``terminate_on_success``: 95 % of the sheep in the goal for 5 s on end.
+
+    ## Info
+
+    Scalars under the same keys at every step: ``in_goal`` and ``ever_in_goal`` (fractions of the sheep), ``path_length`` (mean
+    over the shepherds [m]), ``collisions`` (new contacts since reset), ``is_success`` (95 % in now), ``reward/<name>``
+    (weighted; they add up to the reward), ``share/<name>/<k>`` (shepherd k's own share of a term that has shares).
+
+    ## Arguments
+
+    | name | default | what |
+    |---|---|---|
+    | scenario | ``"paper"`` | a `Scenario`, a preset's name or a TOML file |
+    | rewards | ``"wild"`` | a scheme or its name; ``{}``: none is computed and the reward is 0 |
+    | lidar | ``"default"`` | a `Lidar`; ``None``: no scan is made and observations are empty, (P, 0) |
+    | render_mode | ``None`` | ``"rgb_array"``: pictures of ``render_size`` pixels |
+    | render_size | ``(640, 640)`` | width and height |
+
+    ## Version history
+
+    * v0: first release. The version is bumped whenever the same seed and actions may give other results.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012 (Gymnasium's form)
+
+    def __init__(
+        self,
+        scenario: Scenario | str | Path = "paper",
+        rewards: Scheme | str = "wild",
+        lidar: Lidar | Literal["default"] | None = "default",
+        render_mode: str | None = None,
+        render_size: tuple[int, int] = (640, 640),
+    ) -> None:
+        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
+            raise SettingsError(f"render_mode: {render_mode!r} is not one of {self.metadata['render_modes']}")
+        self.scenario = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
+        self.render_mode = render_mode
+        self.render_size = render_size
+        self._scheme = _scheme(rewards)
+        if lidar == "default":
+            lidar = Lidar(channels=CHANNELS if self.scenario.obstacles else CHANNELS[:3])
+        if lidar is not None and not isinstance(lidar, Lidar):
+            raise SettingsError(f"lidar: needs a Lidar, None or 'default' (given: {lidar!r})")
+        self.lidar = lidar
+        self.world = World(self.scenario)
+
+        # one scan serves observation and rewards: it has every channel that either of them reads
+        wanted = [name for _, term in self._scheme.values() for name in getattr(term, "scans", ())]
+        unknown = [name for name in wanted if name not in (*CHANNELS, *SHEEP_SETS)]
+        if unknown:
+            raise SettingsError(f"rewards: there is no scan {unknown[0]!r}; there are {(*CHANNELS, *SHEEP_SETS)}")
+        self._sets = tuple(name for name in SHEEP_SETS if name in wanted)
+        seen = lidar.channels if lidar is not None else ()
+        channels = tuple(name for name in CHANNELS if name in wanted or name in seen)
+        self._scan_lidar = (lidar or Lidar()).but(channels=channels) if channels or self._sets else None
+
+        n_shepherds = self.scenario.n_shepherds
+        shape = lidar.observation_shape(n_shepherds) if lidar is not None else (n_shepherds, 0)
+        self.observation_space = spaces.Box(0.0, 1.0, shape, np.float32)
+        self.action_space = spaces.Box(-1.0, 1.0, (n_shepherds, 2), np.float32)
+        self.beam_offset = np.zeros(n_shepherds, dtype=np.int64)
+        """(P,) beams by which the latest observation is rolled (goal frame; else 0)."""
+        self._stack = Stack(lidar) if lidar is not None else None
+        self._share_keys = {
+            name: [f"share/{name}/{k}" for k in range(n_shepherds)]
+            for name, (_, term) in self._scheme.items()
+            if hasattr(term, "shares")
+        }
+        self._success_steps = round(SUCCESS_SECONDS / self.scenario.control_dt)
+        self._held = 0
+        self._trails: deque[Floats] = deque(maxlen=TRAIL_STEPS)
+        self._start: Floats | None = None
+        self._scan: Scan | None = None
+
+    @property
+    def state(self) -> WorldState:
+        """The latest state of the world."""
+        return self.world.state
+
+    @property
+    def user_rng(self) -> np.random.Generator:
+        """The stream for controllers and users that ``reset(seed=)`` seeds."""
+        return self.world.user_rng
+
+    @property
+    def scan(self) -> Scan | None:
+        """The latest scan, all beams; None where nothing asks for one."""
+        return self._scan
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Start an episode: that of ``seed``, or the next one of the generator that an earlier seed started."""
+        super().reset(seed=seed)
+        if options:
+            raise SettingsError(f"options: none are known (given: {sorted(options)})")
+        state = self.world.reset(int(self.np_random.integers(2**63)) if seed is None else seed)
+        self._held = 0
+        self.beam_offset = np.zeros(self.scenario.n_shepherds, dtype=np.int64)
+        self._trails.clear()
+        self._start = state.sheep_pos
+        self._scan = self._look()
+        if self._stack is not None:
+            self._stack.reset()
+        zeros = {f"reward/{name}": 0.0 for name in self._scheme}
+        for keys in self._share_keys.values():
+            zeros.update(dict.fromkeys(keys, 0.0))
+        return self._observe(), {**self._measures(state), **zeros}
+
+    def step(self, action: Any) -> tuple[NDArray[np.float32], SupportsFloat, bool, bool, dict[str, Any]]:
+        """One control step.
+
+        Raises:
+            ValueError: the action has another shape or holds a NaN or an infinity; nothing has moved.
+        """
+        before = self.world.state
+        if before.step >= self.scenario.n_steps:
+            raise gym.error.ResetNeeded(f"the episode ended after {before.step} steps: call reset")
+        after = self.world.step(action)
+        if self.render_mode is not None:
+            self._trails.append(after.shepherd_pos)
+        self._scan = self._look()
+        info = self._measures(after)
+        reward = 0.0
+        for name, (weight, term) in self._scheme.items():
+            if name in self._share_keys:
+                shares = term.shares(before, after, self._scan, self.scenario)  # type: ignore[attr-defined]
+                value = float(shares.mean()) if len(shares) else 0.0
+                info.update(zip(self._share_keys[name], shares.tolist(), strict=True))
+            else:
+                value = term(before, after, self._scan, self.scenario)
+            weighted = float(weight * value)
+            info[f"reward/{name}"] = weighted
+            reward += weighted
+        self._held = self._held + 1 if info["is_success"] else 0
+        terminated = self.scenario.terminate_on_success and self._held >= self._success_steps
+        truncated = after.step >= self.scenario.n_steps
+        return self._observe(), reward, terminated, truncated, info
+
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+        """A picture (height, width, 3) of the state, or None without a render mode."""
+        if self.render_mode is None:
+            return None
+        from shepherd_phys.render import draw
+
+        return draw(
+            self.world.state,
+            self.render_size,
+            trails=list(self._trails),
+            start=self._start,
+            influence_radius=getattr(self.scenario.flock, "detection_radius", None),
+        )
+
+    def _look(self) -> Scan | None:
+        return self.world.scan(self._scan_lidar, self._sets) if self._scan_lidar is not None else None
+
+    def _observe(self) -> NDArray[np.float32]:
+        if self.lidar is None or self._stack is None or self._scan is None:
+            return np.zeros((self.scenario.n_shepherds, 0), dtype=np.float32)
+        self._stack.push(encode(self._scan, self.lidar))
+        observation, self.beam_offset = self._stack.observe(self.beam_offset)
+        return observation
+
+    def _measures(self, state: WorldState) -> dict[str, Any]:
+        n = state.n_sheep
+        in_goal = int(np.count_nonzero(state.sheep_in_goal)) / n
+        return {
+            "in_goal": in_goal,
+            "ever_in_goal": int(np.count_nonzero(state.sheep_arrived)) / n,
+            "path_length": float(state.shepherd_path.mean()) if state.n_shepherds else 0.0,
+            "collisions": state.collisions,
+            "is_success": in_goal >= SUCCESS_FRACTION,
+        }
+
+
+def _scheme(rewards: Scheme | str) -> Scheme:
+    """A scheme, checked: a mapping name -> (finite weight, callable term)."""
+    if isinstance(rewards, str):
+        if rewards not in SCHEMES:
+            raise SettingsError(f"rewards: {rewards!r} is not one of {', '.join(SCHEMES)}")
+        return SCHEMES[rewards]
+    try:
+        scheme = {str(name): (float(weight), term) for name, (weight, term) in rewards.items()}
+    except (AttributeError, TypeError, ValueError):
+        raise SettingsError(
+            f"rewards: needs a scheme's name or a mapping name -> (weight, term) (given: {rewards!r})"
+        ) from None
+    for name, (weight, term) in scheme.items():
+        if not callable(term) or not np.isfinite(weight):
+            raise SettingsError(f"rewards[{name!r}]: needs a finite weight and a callable term (given: {weight}, {term!r})")
+    return scheme

@@ -1,0 +1,313 @@
+"""``shepherd-phys benchmark``: how fast the simulator is, as ratios measured side by side in one run.
+
+The load is driving: the ``strombom`` team at work on one flock of 100 sheep, counted while at least half of the sheep are
+threatened. A full step is the environment's: flock, engine, 3 x 3 x 512 beams, observation, ``wild`` rewards with
+their extra scan. One core.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+
+from shepherd_phys.controllers import StrombomTeam
+from shepherd_phys.envs import ShepherdingEnv
+from shepherd_phys.flock import Strombom
+from shepherd_phys.lidar import Lidar, Stack, encode
+from shepherd_phys.scenario import Scenario
+from shepherd_phys.state import WorldState
+from shepherd_phys.world import World
+
+from .impacts import impacts
+from .plain import PlainWorld
+
+SEED = 0
+"""Root seed of the episodes that are timed (tuning seeds)."""
+REFERENCE = {"substeps": 1, "iterations": 10}
+"""The reference step: what one ``space.step`` of a whole control step costs."""
+
+
+@dataclass
+class Arguments:
+    """Measure the simulator's speed; nothing else should run meanwhile."""
+
+    json: bool = False
+    """Print one JSON object on stdout and nothing else there."""
+    runs: Annotated[int, tyro.conf.arg(metavar="R")] = 5
+    """Runs of which the medians are reported."""
+    steps: Annotated[int, tyro.conf.arg(metavar="N")] = 600
+    """Control steps that each run counts."""
+    impacts: Annotated[int, tyro.conf.arg(metavar="N")] = 0
+    """Instead: N impacts of sheep and shepherds, alone and pushed, on the thinnest walls and small pillars."""
+    engine: bool = False
+    """Instead: compare numbers of substeps and iterations by cost, overlap and impacts."""
+
+
+class Stopwatch:
+    """Seconds spent in a function, and how often it was called."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self.function, self.seconds, self.calls = function, 0.0, 0
+
+    def __call__(self, *args: Any, **values: Any) -> Any:
+        """Call the function and count its time."""
+        start = time.perf_counter()
+        result = self.function(*args, **values)
+        self.seconds += time.perf_counter() - start
+        self.calls += 1
+        return result
+
+
+def driving_scenario() -> Scenario:
+    """The paper's world with one flock: the most sheep threatened at once."""
+    return Scenario(n_flocks=1)
+
+
+def threatened(state: WorldState, scenario: Scenario) -> float:
+    """Fraction of the sheep with a shepherd within r_s."""
+    apart = np.linalg.norm(state.sheep_pos[:, None] - state.shepherd_pos[None], axis=2)
+    return float((apart.min(axis=1) <= scenario.flock.detection_radius).mean())
+
+
+class Driven:
+    """A world or env with its own driving team; engine time is counted apart from the rest."""
+
+    def __init__(self, world: World, step: Callable[[Any], Any], reset: Callable[[int], Any]) -> None:
+        self.world, self.step, self._reset = world, Stopwatch(step), reset
+        self.team = StrombomTeam()
+
+    def reset(self, seed: int) -> None:
+        """Begin an episode; its Space is new, so its stopwatch is, too."""
+        self._reset(seed)
+        self.team.reset(self.world.user_rng)
+        assert self.world.space is not None
+        self.engine = Stopwatch(self.world.space.step)
+        self.world.space.step = self.engine  # type: ignore[method-assign, assignment]
+
+    def advance(self) -> tuple[float, float]:
+        """One control step: seconds of the whole, and of the engine in it."""
+        action = self.team.act(np.empty(0, dtype=np.float32), self.world.state)
+        whole, engine = self.step.seconds, self.engine.seconds
+        self.step(action)
+        return self.step.seconds - whole, self.engine.seconds - engine
+
+
+def drive(scenario: Scenario, n_steps: int, seed: int, *, with_plain: bool = True) -> dict[str, float]:
+    """One run: the env, the reference twin and, now and then, the plain step, alternating on the same episodes."""
+    env = ShepherdingEnv(scenario, rewards="wild")
+    twin_world = World(scenario.but(**REFERENCE))
+    mine = Driven(env.world, env.step, lambda s: env.reset(seed=s))
+    twin = Driven(twin_world, twin_world.step, twin_world.reset)
+    whole = engine = reference = plain = beside = 0.0
+    counted = pairs = 0
+    while counted < n_steps:
+        mine.reset(seed)
+        twin.reset(seed)
+        seed += 1
+        for _ in range(scenario.n_steps):
+            before = env.state
+            action = mine.team.act(np.empty(0, dtype=np.float32), before)
+            seconds, physics = mine.advance()
+            _, other = twin.advance()
+            if threatened(env.state, scenario) < 0.5:
+                continue
+            counted += 1
+            whole, engine, reference = whole + seconds, engine + physics, reference + other
+            if with_plain and counted % 40 == 0:
+                slow = PlainWorld(scenario, before, np.random.default_rng(seed))
+                start = time.perf_counter()
+                slow.step(action)
+                plain += time.perf_counter() - start
+                beside += seconds
+                pairs += 1
+            if counted >= n_steps:
+                break
+    result = {
+        "world_steps_per_second": counted / whole,
+        "overhead_ratio": (whole - engine) / reference,
+        "physics_ratio": engine / reference,
+        "step_us": whole / counted * 1e6,
+        "engine_us": engine / counted * 1e6,
+        "reference_us": reference / counted * 1e6,
+    }
+    if pairs:
+        # the steps beside a plain one run on caches that it has emptied: compare with the mean of all
+        result["speedup_over_plain_pymunk"] = (plain / pairs) / (whole / counted)
+        result["plain_us"] = plain / pairs * 1e6
+    return result
+
+
+def parts(scenario: Scenario) -> dict[str, float]:
+    """Microseconds of each part of a step, on a state in the middle of driving, each timed alone."""
+    env = ShepherdingEnv(scenario, rewards="wild")
+    team = StrombomTeam()
+    env.reset(seed=SEED)
+    team.reset(env.user_rng)
+    while True:
+        before = env.state
+        env.step(team.act(np.empty(0, dtype=np.float32), before))
+        if threatened(env.state, scenario) == 1.0 and env.state.step > 100:
+            break
+    world, lidar, rng = env.world, Lidar(), np.random.default_rng(0)
+    scan, stack = world.scan(lidar, ("wild",)), Stack(lidar)
+    offset = np.zeros(scenario.n_shepherds, dtype=np.int64)
+
+    def observation() -> None:
+        stack.push(encode(scan, lidar))
+        stack.observe(offset)
+
+    def rewards() -> None:
+        for _, term in env._scheme.values():
+            term(before, env.state, scan, scenario)
+
+    timed: dict[str, Callable[[], Any]] = {
+        "flock": lambda: scenario.flock.velocities(before, rng),
+        "lidar": lambda: world.scan(lidar, ("wild",)),
+        "observation": observation,
+        "rewards": rewards,
+    }
+    result = {}
+    for name, function in timed.items():
+        times = []
+        for _ in range(400):
+            start = time.perf_counter()
+            function()
+            times.append(time.perf_counter() - start)
+        result[name] = statistics.median(times) * 1e6
+    return result
+
+
+def scaling(counts: tuple[int, ...] = (100, 1_000, 10_000)) -> dict[str, float]:
+    """Microseconds per sheep and step, flock and physics only, every sheep threatened, after 50 steps of settling."""
+    result = {}
+    for n in counts:
+        scenario = Scenario(
+            n_sheep=n,
+            n_flocks=1,
+            flock_sd=float(np.sqrt(n / 100)),
+            flock=Strombom(detection_radius=1e6, n_neighbours=40),
+        )
+        world = World(scenario)
+        world.reset(SEED)
+        still = np.zeros((scenario.n_shepherds, 2))
+        for _ in range(50):
+            world.step(still)
+        times = []
+        for _ in range(max(5, 20_000 // n)):
+            start = time.perf_counter()
+            world.step(still)
+            times.append(time.perf_counter() - start)
+        result[str(n)] = statistics.median(times) / n * 1e6
+    return result
+
+
+def overlaps(scenario: Scenario, n_steps: int = 1_500) -> dict[str, float]:
+    """How deep sheep are in one another and in shepherds while driven, at the end of each control step [m]."""
+    world, team, deepest, seed = World(scenario), StrombomTeam(), [], SEED
+    while len(deepest) < n_steps:
+        world.reset(seed)
+        team.reset(world.user_rng)
+        seed += 1
+        for _ in range(scenario.n_steps):
+            state = world.step(team.act(np.empty(0, dtype=np.float32), world.state))
+            if threatened(state, scenario) < 0.5:
+                continue
+            pos = np.concatenate([state.sheep_pos, state.shepherd_pos])
+            radius = np.concatenate([state.sheep_radius, state.shepherd_radius])
+            gap = np.linalg.norm(pos[:, None] - pos[None], axis=2) - radius[:, None] - radius[None]
+            np.fill_diagonal(gap, np.inf)
+            deepest.append(max(0.0, -gap.min()))
+    return {"median": float(np.median(deepest)), "p99": float(np.quantile(deepest, 0.99)), "max": max(deepest)}
+
+
+def compare_engines(runs: int, n_steps: int, n_impacts: int) -> list[dict[str, Any]]:
+    """Cost, overlap and tunnelling for numbers of substeps and iterations, interleaved run by run."""
+    choices = [(1, 4), (1, 10), (2, 1), (2, 2), (2, 3), (2, 4), (2, 6), (2, 10), (3, 4), (4, 4)]
+    ratios: dict[tuple[int, int], list[float]] = {choice: [] for choice in choices}
+    for run in range(runs):
+        for substeps, iterations in choices:
+            scenario = driving_scenario().but(substeps=substeps, iterations=iterations)
+            ratios[substeps, iterations].append(
+                drive(scenario, n_steps, SEED + 100 * run, with_plain=False)["physics_ratio"]
+            )
+            print(f"run {run + 1}/{runs}: {substeps} substeps x {iterations} iterations", file=sys.stderr)
+    rows = []
+    for substeps, iterations in choices:
+        scenario = driving_scenario().but(substeps=substeps, iterations=iterations)
+        deep = overlaps(scenario)
+        hit = impacts(n_impacts, seed=SEED, substeps=substeps, iterations=iterations)
+        rows.append(
+            {
+                "substeps": substeps,
+                "iterations": iterations,
+                "physics_ratio": statistics.median(ratios[substeps, iterations]),
+                "overlap_median_m": deep["median"],
+                "overlap_p99_m": deep["p99"],
+                "overlap_max_m": deep["max"],
+                "impacts": hit["impacts"],
+                "tunnelled": hit["tunnelled"],
+            }
+        )
+    return rows
+
+
+def machine() -> str:
+    """What the figures were measured on."""
+    model = platform.processor() or platform.machine()
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as file:
+            model = next((line.split(":", 1)[1].strip() for line in file if line.startswith("model name")), model)
+    except OSError:
+        pass  # not Linux: what platform knows must do
+    return f"{model}, {os.cpu_count()} cores, Python {platform.python_version()}"
+
+
+def main(argv: list[str]) -> int:
+    """Run the command."""
+    args = tyro.cli(Arguments, prog="shepherd-phys benchmark", args=argv)
+    for name in ("runs", "steps"):
+        if getattr(args, name) < 1:
+            print(f"--{name}: must be at least 1 (given: {getattr(args, name)})", file=sys.stderr)
+            return 2
+    if args.impacts < 0:
+        print(f"--impacts: must not be negative (given: {args.impacts})", file=sys.stderr)
+        return 2
+    result: Any
+    if args.engine:
+        result = compare_engines(args.runs, args.steps, args.impacts or 5_000)
+    elif args.impacts:
+        result = impacts(args.impacts, seed=SEED)
+    else:
+        drive(driving_scenario(), 50, SEED)  # compile everything first
+        runs = []
+        for run in range(args.runs):
+            runs.append(drive(driving_scenario(), args.steps, SEED + 100 * run))
+            print(f"run {run + 1}/{args.runs}: {runs[-1]['world_steps_per_second']:.0f} steps/s", file=sys.stderr)
+        scales = [scaling() for _ in range(min(args.runs, 3))]
+        result = {key: statistics.median(run[key] for run in runs) for key in runs[0]}
+        result["parts_us"] = parts(driving_scenario())
+        result["sheep_scaling"] = {key: statistics.median(s[key] for s in scales) for key in scales[0]}
+        result["runs"] = args.runs
+    if args.json:
+        print(json.dumps(result, indent=2))
+        return 0
+    print(f"on {machine()}")
+    for row in result if isinstance(result, list) else [result]:
+        for key, value in row.items():
+            shown = f"{value:.4g}" if isinstance(value, float) else value
+            if isinstance(value, dict):
+                shown = ", ".join(f"{k}: {v:.4g}" for k, v in value.items())
+            print(f"{key:28} {shown}" if not isinstance(result, list) else f"{key}={shown}", end="  " if isinstance(result, list) else "\n")
+        if isinstance(result, list):
+            print()
+    return 0

@@ -1,0 +1,177 @@
+"""`Scenario`: what a world holds, how it is placed and how it is stepped; presets; TOML in and out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator, Field
+
+from shepherd_phys.bodies import BODIES, SHEEP, Body, Disc
+from shepherd_phys.flock import FLOCKS, FlockModel, Strombom
+from shepherd_phys.obstacles import OBSTACLES, Obstacle
+from shepherd_phys.settings import (
+    Settings,
+    SettingsError,
+    handed_over,
+    read_toml,
+    settings,
+    tagged,
+    untagged,
+    write_toml,
+)
+
+
+def _team(value: Any) -> Any:
+    """A number of shepherds means that many default discs."""
+    if isinstance(value, int) and not isinstance(value, bool):
+        if not 0 <= value <= 10_000:
+            raise ValueError("a number of shepherds lies in 0..10000")
+        return (Disc(),) * value
+    if isinstance(value, list | tuple):
+        return tuple(value)
+    raise ValueError("give bodies, or how many default discs there are")
+
+
+def _interval(value: Any) -> Any:
+    """Two numbers, the smaller first."""
+    if isinstance(value, list | tuple) and len(value) == 2 and value[0] > value[1]:
+        raise ValueError("the smaller number comes first")
+    return value
+
+
+@settings
+class Scenario(Settings):
+    """What a world holds, how it is placed at reset, and its two clocks.
+
+    All defaults are the paper's world, with the resolutions of what it leaves open.
+    """
+
+    n_sheep: int = Field(default=100, ge=1)
+    """N."""
+    n_flocks: int = Field(default=2, ge=1)
+    """Flocks of equal size (+-1) at the start."""
+    flock_distance: Annotated[
+        tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]], BeforeValidator(_interval)
+    ] = (10.0, 20.0)
+    """Least and largest distance of a flock's centre from the goal's centre, drawn uniformly [m]."""
+    flock_sd: float = Field(default=1.0, gt=0)
+    """Standard deviation of a flock's members about its centre, each axis [m]."""
+    box: float = Field(default=50.0, gt=0)
+    """Side of the square, centred on the origin, in which goal and shepherds are placed [m]; the plane is unbounded."""
+    goal_radius: float = Field(default=2.5, gt=0)
+    """R [m]."""
+    goal_pos: tuple[float, float] | None = None
+    """Centre g of the goal [m]; drawn uniformly from the box where None."""
+    shepherds: Annotated[tuple[Any, ...], BeforeValidator(_team)] = (Disc(), Disc(), Disc())
+    """One body a shepherd; a number means that many default discs."""
+    sheep: Any = SHEEP
+    """The sheep's body."""
+    flock: Any = Strombom()
+    """How sheep move: a flock model."""
+    obstacles: tuple[Any, ...] = ()
+    """Solid, static things."""
+    n_steps: int = Field(default=1000, ge=1)
+    """T: control steps of an episode; the nominal length in every formula."""
+    control_dt: float = Field(default=0.2, gt=0)
+    """Length of a control step [s]."""
+    substeps: int = Field(default=2, ge=1)
+    """Engine steps in a control step. Two keep every body at top speed, even pushed, on its side of the
+    thinnest wall; one does not (measured by ``shepherd-phys benchmark --impacts``)."""
+    iterations: int = Field(default=4, ge=1)
+    """Iterations of the engine's contact solver in an engine step."""
+    collision_slop: float = Field(default=0.005, ge=0)
+    """Overlap that the engine lets resting bodies keep [m]."""
+    max_acceleration: float = Field(default=30.0, gt=0)
+    """Servo forces are clipped to mass times this [m/s2], so that contacts and walls win."""
+    max_angular_acceleration: float = Field(default=60.0, gt=0)
+    """The same for turning [rad/s2]."""
+    terminate_on_success: bool = False
+    """End the episode when 95 % of the sheep have been in the goal for 5 s on end."""
+
+    def __post_init__(self) -> None:
+        if self.n_flocks > self.n_sheep:
+            raise ValueError(f"n_flocks is {self.n_flocks}, more than there are sheep ({self.n_sheep})")
+
+    @property
+    def n_shepherds(self) -> int:
+        """P."""
+        return len(self.shepherds)
+
+    @property
+    def physics_dt(self) -> float:
+        """Length of an engine step [s]."""
+        return self.control_dt / self.substeps
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data from which `from_dict` makes an equal scenario."""
+        table = Settings.to_dict(self)
+        table["shepherds"] = [tagged(body) for body in self.shepherds]
+        table["sheep"] = tagged(self.sheep)
+        table["flock"] = tagged(self.flock)
+        table["obstacles"] = [tagged(obstacle) for obstacle in self.obstacles]
+        return table
+
+    @classmethod
+    def from_dict(cls, table: Mapping[str, Any], classes: Iterable[Any] = ()) -> Scenario:
+        """The scenario that plain data describe; fields left out keep their defaults.
+
+        Args:
+            table: what `to_dict` gives, or parts of it.
+            classes: a user's own classes of bodies, flock models and obstacles; nothing is ever imported by name.
+
+        Raises:
+            SettingsError: a field is unknown or impossible.
+        """
+        values = dict(table)
+        own = handed_over(classes)
+        if isinstance(values.get("shepherds"), list):
+            values["shepherds"] = tuple(
+                untagged(body, BODIES | own, f"Scenario.shepherds[{i}]") for i, body in enumerate(values["shepherds"])
+            )
+        if "sheep" in values:
+            values["sheep"] = untagged(values["sheep"], BODIES | own, "Scenario.sheep")
+        if "flock" in values:
+            values["flock"] = untagged(values["flock"], FLOCKS | own, "Scenario.flock")
+        if "obstacles" in values:
+            if not isinstance(values["obstacles"], list):
+                raise SettingsError(f"Scenario.obstacles: must be a list of tables (given: {values['obstacles']!r})")
+            values["obstacles"] = tuple(
+                untagged(thing, OBSTACLES | own, f"Scenario.obstacles[{i}]")
+                for i, thing in enumerate(values["obstacles"])
+            )
+        return cls(**values)
+
+    def to_toml(self, path: str | Path) -> None:
+        """Write the scenario as a TOML file."""
+        write_toml(self.to_dict(), path)
+
+    @classmethod
+    def from_toml(cls, path: str | Path, classes: Iterable[Any] = ()) -> Scenario:
+        """Read a scenario from a TOML file; see `from_dict`."""
+        return cls.from_dict(read_toml(path), classes)
+
+
+SCENARIOS: dict[str, Scenario] = {
+    "paper": Scenario(),
+    "single": Scenario(n_flocks=1),
+    "small": Scenario(n_sheep=20, n_flocks=2, shepherds=2, flock=Strombom(n_neighbours=8), n_steps=500),
+}
+"""Presets by name: the paper's world; one flock; a small one for quick looks."""
+
+
+def load_scenario(name_or_path: str | Path, classes: Iterable[Any] = ()) -> Scenario:
+    """A preset by its name, or a scenario from a TOML file.
+
+    Raises:
+        SettingsError: it is neither, or the file is not a scenario.
+    """
+    if str(name_or_path) in SCENARIOS:
+        return SCENARIOS[str(name_or_path)]
+    if str(name_or_path).endswith(".toml"):
+        return Scenario.from_toml(name_or_path, classes)
+    raise SettingsError(f"scenario: {str(name_or_path)!r} is neither a .toml file nor one of {', '.join(SCENARIOS)}")
+
+
+__all__ = ["SCENARIOS", "Body", "FlockModel", "Obstacle", "Scenario", "load_scenario"]

@@ -1,0 +1,468 @@
+"""`World`: owns the pymunk Space; reset, step, state, scan.
+
+Speed comes from crossing between Python and C few times: one batch write and one batch read an engine step,
+one compiled call for the flock, one for the servo, one for the measures of the new state, one for all scans.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numba
+import numpy as np
+import pymunk
+from numpy.typing import ArrayLike, NDArray
+from pymunk import batch
+
+from shepherd_phys.bodies import Disc, built
+from shepherd_phys.geometry import (
+    OBSTACLE_CATEGORY,
+    OBSTACLES,
+    SHEEP,
+    SHEEP_CATEGORY,
+    SHEPHERD_CATEGORY,
+    SHEPHERDS,
+    compile_shapes,
+)
+from shepherd_phys.lidar import Lidar, Scan, Sensor
+from shepherd_phys.obstacles import solid
+from shepherd_phys.placement import place, relax
+from shepherd_phys.scenario import Scenario
+from shepherd_phys.settings import Foreign, SettingsError, kind_of
+from shepherd_phys.state import Floats, WorldState, frozen
+
+SHEEP_SETS = {
+    "wild": lambda state: ~state.sheep_arrived,
+    "outside": lambda state: ~state.sheep_in_goal,
+}
+"""Sheep that can be scanned on their own: never been in the goal; outside it now."""
+
+RELAX_SWEEPS = 2_000
+"""Sweeps after which placing gives up; 100 sheep at the paper's density need a few dozen."""
+
+_LINEAR = batch.BodyFields.POSITION | batch.BodyFields.VELOCITY
+_POSES = _LINEAR | batch.BodyFields.ANGLE | batch.BodyFields.ANGULAR_VELOCITY
+
+
+class NonFiniteError(FloatingPointError):
+    """A number that is not finite was about to reach the engine, or came out of it."""
+
+
+class World:
+    """The simulated world of one scenario.
+
+    Every reset makes a fresh Space (a used one would carry contacts over and change the episode), with bodies in a
+    fixed order: sheep, shepherds. An episode is determined by the scenario, the seed and the actions.
+
+    Args:
+        scenario: what it holds.
+
+    Attributes:
+        scenario: the same.
+        state: the latest `WorldState`; `reset` makes the first.
+        user_rng: generator for controllers and users, seeded by `reset` apart from the world's own.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        for thing in (*scenario.shepherds, scenario.sheep, scenario.flock, *scenario.obstacles):
+            if isinstance(thing, Foreign):
+                raise thing.missing()
+        if not hasattr(scenario.flock, "velocities"):
+            raise SettingsError(f"flock ({kind_of(scenario.flock)}): a flock model needs 'velocities'")
+        self.scenario = scenario
+        self.space: pymunk.Space | None = None
+        self._n = scenario.n_sheep
+        self._p = scenario.n_shepherds
+        # batch buffers are never freed by pymunk: made once, used by every Space of this world
+        self._read_buffer = batch.Buffer()
+        self._write_buffer = batch.Buffer()
+        self._state: WorldState | None = None
+
+    @property
+    def state(self) -> WorldState:
+        """The latest state.
+
+        Raises:
+            RuntimeError: there was no reset yet.
+        """
+        if self._state is None:
+            raise RuntimeError("the world has no state yet: call reset first")
+        return self._state
+
+    # ------------------------------------------------------------------ reset
+
+    def reset(self, seed: int) -> WorldState:
+        """Start the episode of a seed.
+
+        Args:
+            seed: not negative; the same seed gives the same episode.
+
+        Raises:
+            SettingsError: bodies or obstacles cannot be built, or leave no room.
+        """
+        scenario = self.scenario
+        placement = self._seed(seed)
+        bodies, static = self._new_bodies()
+        goal, sheep_pos, shepherd_pos = place(
+            placement,
+            n_sheep=self._n,
+            n_flocks=scenario.n_flocks,
+            flock_distance=scenario.flock_distance,
+            flock_sd=scenario.flock_sd,
+            n_shepherds=self._p,
+            box=scenario.box,
+            goal_pos=scenario.goal_pos,
+        )
+        solids = compile_shapes([(shape, -1, OBSTACLES) for shape in static])
+        pos = relax(
+            np.concatenate([sheep_pos, shepherd_pos]),
+            np.array([reach for _, _, reach in bodies]),
+            push_out=(lambda at, radius: push_out(solids, at, radius)) if static else None,
+            max_sweeps=RELAX_SWEEPS,
+        )
+        angle = self._noise.uniform(0.0, 2 * np.pi, self._n)
+        motion = np.zeros((self._n + self._p, 6))
+        motion[:, :2] = pos
+        return self._start(
+            bodies,
+            static,
+            goal,
+            motion,
+            np.stack([np.cos(angle), np.sin(angle)], axis=1),
+            np.zeros(self._n, dtype=np.bool_),
+        )
+
+    def reset_to(self, state: WorldState, seed: int) -> WorldState:
+        """Start an episode from a given arrangement instead of a drawn one.
+
+        Args:
+            state: where everything is, how it moves and which sheep have arrived; its clock and what it has counted
+                are not taken over. Make one with ``world.reset(0).but(sheep_pos=..)``.
+            seed: of the sheep's noise and of ``user_rng``.
+
+        Raises:
+            ValueError: the state has other numbers of sheep or shepherds than the scenario.
+            NonFiniteError: it holds a number that is not finite.
+        """
+        if (state.n_sheep, state.n_shepherds) != (self._n, self._p):
+            raise ValueError(
+                f"state: needs {self._n} sheep and {self._p} shepherds (given: {state.n_sheep} and {state.n_shepherds})"
+            )
+        self._seed(seed)
+        bodies, static = self._new_bodies()
+        motion = np.zeros((self._n + self._p, 6))
+        motion[:, :2] = np.concatenate([state.sheep_pos, state.shepherd_pos])
+        motion[self._n :, 2] = state.shepherd_angle
+        motion[:, 3:5] = np.concatenate([state.sheep_vel, state.shepherd_vel])
+        if not (np.isfinite(motion).all() and np.isfinite(state.sheep_heading).all()):
+            raise NonFiniteError("state: every position, velocity and heading must be finite")
+        return self._start(bodies, static, state.goal_pos, motion, state.sheep_heading, state.sheep_arrived)
+
+    def _seed(self, seed: int) -> np.random.Generator:
+        """Seed the sheep's noise and the users' stream; the stream of the placement is returned."""
+        placement, noise, users = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(3))
+        self._noise = noise
+        self.user_rng = users
+        return placement
+
+    def _new_bodies(self) -> tuple[list[tuple[pymunk.Body, list[pymunk.Shape], float]], list[pymunk.Shape]]:
+        """A fresh Space, the bodies for it in their fixed order, and the obstacles' shapes."""
+        scenario = self.scenario
+        space = pymunk.Space()
+        space.iterations = scenario.iterations
+        space.collision_slop = scenario.collision_slop
+        self.space = space
+        bodies = [built(scenario.sheep, "sheep") for _ in range(self._n)]
+        bodies += [built(body, f"shepherd {k}") for k, body in enumerate(scenario.shepherds)]
+        static = [
+            shape
+            for index, obstacle in enumerate(scenario.obstacles)
+            for shape in solid(obstacle, index, space.static_body)
+        ]
+        return bodies, static
+
+    def _start(
+        self,
+        bodies: list[tuple[pymunk.Body, list[pymunk.Shape], float]],
+        static: list[pymunk.Shape],
+        goal: Floats,
+        motion: Floats,
+        heading: Floats,
+        arrived: NDArray[np.bool_],
+    ) -> WorldState:
+        """Put everything into the Space and read the first state; ``motion`` rows are x, y, angle, vx, vy, spin."""
+        scenario, space = self.scenario, self.space
+        assert space is not None  # _new_bodies made it
+        self._shapes: list[tuple[pymunk.Shape, int, int]] = []
+        for row, (body, shapes, _) in enumerate(bodies):
+            is_sheep = row < self._n
+            category = SHEEP_CATEGORY if is_sheep else SHEPHERD_CATEGORY
+            x, y, angle, vx, vy, spin = motion[row].tolist()
+            body.position = x, y
+            body.velocity = vx, vy
+            body.angle, body.angular_velocity = angle, spin
+            for shape in shapes:
+                # a group of its own lets a shepherd's beams pass its own shapes
+                shape.filter = pymunk.ShapeFilter(group=0 if is_sheep else row - self._n + 1, categories=category)
+                shape.collision_type = category
+                self._shapes.append((shape, row, SHEEP if is_sheep else SHEPHERDS))
+            space.add(body, *shapes)
+        for shape in static:
+            shape.filter = pymunk.ShapeFilter(categories=OBSTACLE_CATEGORY)
+            shape.collision_type = OBSTACLE_CATEGORY
+            self._shapes.append((shape, -1, OBSTACLES))
+            space.add(shape)
+        self._collisions = 0
+        for other in (OBSTACLE_CATEGORY, SHEPHERD_CATEGORY):
+            space.on_collision(SHEPHERD_CATEGORY, other, begin=self._count_collision)
+
+        n, p = self._n, self._p
+        radius = np.array([reach for _, _, reach in bodies])
+        self._radius = frozen(radius[:n].copy()), frozen(radius[n:].copy())
+        self._speed = frozen(np.array([float(body.max_speed) for body in scenario.shepherds]))
+        self._sheep_speed = frozen(np.full(n, float(scenario.sheep.max_speed)))
+        self._goal = frozen(np.array(goal, dtype=np.float64))
+        self._mass = np.array([body.mass for body, _, _ in bodies])
+        self._moment = np.array([body.moment for body, _, _ in bodies])
+        # a body of infinite moment cannot spin: where that holds for all, angles are neither read nor written
+        self._spins = bool(np.isfinite(self._moment).any())
+        self._followers = [(n + k, body) for k, body in enumerate(scenario.shepherds) if type(body) is not Disc]
+        if type(scenario.sheep) is not Disc:
+            self._followers = [(i, scenario.sheep) for i in range(n)] + self._followers
+        self._sensors: dict[Lidar, Sensor] = {}
+
+        # the static body, once touched, is the last row of every batch
+        n_rows = n + p + (1 if static else 0)
+        self._command = np.zeros((n + p, 3))
+        self._force = np.zeros((n_rows, 3 if self._spins else 2))
+        self._write_buffer.set_float_buf(self._force)
+        self._fields = _POSES if self._spins else _LINEAR
+        self._force_fields = batch.BodyFields.FORCE | batch.BodyFields.TORQUE if self._spins else batch.BodyFields.FORCE
+
+        rows = self._read()
+        self._state = self._measure(rows, 0, heading, arrived, rows[n : n + p, :2], np.zeros(p))
+        return self._state
+
+    def _count_collision(self, arbiter: pymunk.Arbiter, space: pymunk.Space, data: Any) -> None:
+        self._collisions += 1
+
+    # ------------------------------------------------------------------- step
+
+    def step(self, action: ArrayLike) -> WorldState:
+        """One control step.
+
+        Args:
+            action: (P, 2) wanted velocities over top speed, world axes; longer than 1 is clipped to the unit disc.
+
+        Raises:
+            ValueError: the action has another shape.
+            NonFiniteError: the action, or what the flock model wants, is not finite; nothing has moved.
+        """
+        state, scenario = self.state, self.scenario
+        space = self.space
+        assert space is not None  # a state implies a Space
+        action = np.asarray(action, dtype=np.float64)
+        if action.shape != (self._p, 2):
+            raise ValueError(f"action: needs shape ({self._p}, 2), one row a shepherd (given: {action.shape})")
+        wanted = scenario.flock.velocities(state, self._noise)
+        if wanted.shape != (self._n, 2):
+            raise ValueError(f"flock model: velocities need shape ({self._n}, 2) (given: {wanted.shape})")
+        command = self._command
+        bad = _command(wanted, self._sheep_speed, action, self._speed, command)
+        if bad:
+            who = "action" if bad == 1 else f"velocities of the flock model ({type(scenario.flock).__name__})"
+            raise NonFiniteError(f"{who}: every number must be finite")
+
+        h = scenario.physics_dt
+        rows = self._rows
+        for substep in range(scenario.substeps):
+            if self._followers:
+                command = self._follow(rows, h)
+            _servo(
+                rows,
+                command,
+                self._mass,
+                self._moment,
+                h,
+                scenario.max_acceleration,
+                scenario.max_angular_acceleration,
+                self._spins,
+                self._force,
+            )
+            batch.set_space_bodies(space, self._force_fields, self._write_buffer)
+            space.step(h)
+            if substep + 1 < scenario.substeps:
+                rows = self._read()
+
+        self._state = self._measure(
+            self._read(), state.step + 1, state.sheep_heading, state.sheep_arrived, state.shepherd_pos, state.shepherd_path
+        )
+        return self._state
+
+    def _follow(self, rows: Floats, h: float) -> Floats:
+        """Let the bodies that are no plain discs turn what is wanted of them into what they do."""
+        followed = self._command.copy()
+        for row, body in self._followers:
+            pose = rows[row].copy() if self._spins else np.array([*rows[row, :2], 0.0, *rows[row, 2:], 0.0])
+            velocity, spin = body.follow(pose, self._command[row, :2].copy(), h)
+            followed[row, 0], followed[row, 1] = velocity
+            followed[row, 2] = spin
+            if not all(map(math.isfinite, followed[row])):
+                raise NonFiniteError(f"{type(body).__name__}.follow: velocity {velocity} and spin {spin} must be finite")
+        return followed
+
+    def _read(self) -> Floats:
+        """One batch read: (rows, 4) x, y, vx, vy or (rows, 6) x, y, angle, vx, vy, spin."""
+        buffer = self._read_buffer
+        buffer.clear()
+        batch.get_space_bodies(self.space, self._fields, buffer)
+        flat = np.frombuffer(buffer.float_buf())
+        if flat.size != len(self._force) * (6 if self._spins else 4):
+            raise RuntimeError("pymunk's batch API gave another number of values than asked for")
+        self._rows: Floats = flat.reshape(len(self._force), -1)
+        return self._rows
+
+    def _measure(
+        self, rows: Floats, step: int, heading: Floats, arrived: NDArray[np.bool_], previous: Floats, path: Floats
+    ) -> WorldState:
+        """Make the state of what was read."""
+        scenario = self.scenario
+        finite, pos, vel, heading, distance, inside, ever, shepherds, shepherds_vel, angle, walked = _measure(
+            rows, self._n, self._p, self._command, heading, arrived, previous, path, self._goal, scenario.goal_radius
+        )
+        if not finite:
+            raise NonFiniteError("the engine gave positions or velocities that are not finite")
+        for array in (pos, vel, heading, distance, inside, ever, shepherds, shepherds_vel, angle, walked):
+            array.flags.writeable = False
+        return WorldState(
+            step,
+            step * scenario.control_dt,
+            self._goal,
+            scenario.goal_radius,
+            pos,
+            vel,
+            heading,
+            distance,
+            inside,
+            ever,
+            self._radius[0],
+            self._sheep_speed,
+            shepherds,
+            shepherds_vel,
+            angle,
+            self._radius[1],
+            self._speed,
+            walked,
+            self._collisions,
+            scenario.obstacles,
+            scenario.control_dt,
+        )
+
+    # ------------------------------------------------------------------- scan
+
+    def scan(self, lidar: Lidar, sets: tuple[str, ...] = ()) -> Scan:
+        """What every shepherd's lidar reads now.
+
+        Args:
+            lidar: its settings.
+            sets: names of `SHEEP_SETS` to scan on their own besides.
+        """
+        state = self.state
+        sensor = self._sensors.get(lidar)
+        if sensor is None:
+            sheep_shapes: list[list[pymunk.Shape]] = [[] for _ in range(self._n)]
+            for shape, row, channel in self._shapes:
+                if channel == SHEEP:
+                    sheep_shapes[row].append(shape)
+            sensor = Sensor(lidar, compile_shapes(self._shapes), self.space, sheep_shapes, self._n, self._p)
+            self._sensors[lidar] = sensor
+        masks: Mapping[str, NDArray[np.bool_]] = {name: SHEEP_SETS[name](state) for name in sets}
+        poses = _poses(self._rows, self._n + self._p, self._spins)
+        return sensor.scan(poses, state.goal_pos, state.goal_radius, masks)
+
+
+@numba.njit(cache=True)
+def _command(wanted, sheep_speed, action, speed, command):  # type: ignore[no-untyped-def]
+    """Write all wanted velocities; 0 if they are finite, 1 if the action is not, 2 if the flock's are not."""
+    n = len(wanted)
+    for k in range(len(action)):
+        x, y = action[k, 0], action[k, 1]
+        length = math.hypot(x, y)
+        if not math.isfinite(x) or not math.isfinite(y):
+            return 1
+        if length > 1.0:  # a length that overflowed to infinity still has a direction
+            scale = max(abs(x), abs(y))
+            x, y = x / scale, y / scale
+            length = math.hypot(x, y)
+            x, y = x / length, y / length
+        command[n + k, 0] = x * speed[k]
+        command[n + k, 1] = y * speed[k]
+    for i in range(n):
+        if not math.isfinite(wanted[i, 0]) or not math.isfinite(wanted[i, 1]):
+            return 2
+        command[i, 0] = wanted[i, 0]
+        command[i, 1] = wanted[i, 1]
+    return 0
+
+
+@numba.njit(cache=True)
+def _servo(rows, command, mass, moment, h, limit, spin_limit, spins, force):  # type: ignore[no-untyped-def]
+    """F = m (v* - v) / h, no longer than m times the limit; torque likewise."""
+    v = 3 if spins else 2
+    for i in range(len(command)):
+        ax = (command[i, 0] - rows[i, v]) / h
+        ay = (command[i, 1] - rows[i, v + 1]) / h
+        size = math.sqrt(ax * ax + ay * ay)
+        scale = mass[i] * (limit / size if size > limit else 1.0)
+        force[i, 0] = ax * scale
+        force[i, 1] = ay * scale
+        if spins:
+            turn = min(max((command[i, 2] - rows[i, 5]) / h, -spin_limit), spin_limit)
+            force[i, 2] = turn * moment[i] if math.isfinite(moment[i]) else 0.0
+
+
+@numba.njit(cache=True)
+def _measure(rows, n, p, command, heading, arrived, previous, path, goal, goal_radius):  # type: ignore[no-untyped-def]
+    """Positions, velocities, headings, distances to the goal, who is in it, and what the shepherds walked."""
+    spins = rows.shape[1] == 6
+    v = 3 if spins else 2
+    pos, vel, turned = np.empty((n, 2)), np.empty((n, 2)), np.empty((n, 2))
+    distance, inside, ever = np.empty(n), np.empty(n, np.bool_), np.empty(n, np.bool_)
+    total = 0.0  # not finite as soon as one of its terms is not
+    for i in range(n):
+        x, y = rows[i, 0], rows[i, 1]
+        pos[i, 0], pos[i, 1] = x, y
+        vel[i, 0], vel[i, 1] = rows[i, v], rows[i, v + 1]
+        total += x + y + vel[i, 0] + vel[i, 1]
+        # a sheep that stands still keeps the direction that it was last commanded
+        cx, cy = command[i, 0], command[i, 1]
+        length = math.hypot(cx, cy)
+        turned[i, 0] = cx / length if length > 0.0 else heading[i, 0]
+        turned[i, 1] = cy / length if length > 0.0 else heading[i, 1]
+        d = math.hypot(x - goal[0], y - goal[1])
+        inside[i] = d <= goal_radius
+        distance[i] = max(d - goal_radius, 0.0)
+        ever[i] = arrived[i] or inside[i]
+    shepherds, shepherds_vel, angle, walked = np.empty((p, 2)), np.empty((p, 2)), np.zeros(p), np.empty(p)
+    for k in range(p):
+        x, y = rows[n + k, 0], rows[n + k, 1]
+        shepherds[k, 0], shepherds[k, 1] = x, y
+        shepherds_vel[k, 0], shepherds_vel[k, 1] = rows[n + k, v], rows[n + k, v + 1]
+        if spins:
+            angle[k] = rows[n + k, 2]
+        total += x + y + shepherds_vel[k, 0] + shepherds_vel[k, 1] + angle[k]
+        walked[k] = path[k] + math.hypot(x - previous[k, 0], y - previous[k, 1])
+    return math.isfinite(total), pos, vel, turned, distance, inside, ever, shepherds, shepherds_vel, angle, walked
+
+
+@numba.njit(cache=True)
+def _poses(rows, k, spins):  # type: ignore[no-untyped-def]
+    """(K, 3) x, y, angle of all bodies that move."""
+    poses = np.zeros((k, 3))
+    for i in range(k):
+        poses[i, 0], poses[i, 1] = rows[i, 0], rows[i, 1]
+        if spins:
+            poses[i, 2] = rows[i, 2]
+    return poses
