@@ -7,8 +7,8 @@ Strombom et al. 2014 (J. R. Soc. Interface 11:20140719), one shepherd S, sheep A
 * else drive, target P_d = GCM + r_a sqrt(N) unit(GCM - goal);
 * S <- S + delta_s unit(unit(target - S) + e eps).
 
-For M shepherds (the V formation of Fujioka 2018, distinct outliers): shepherd k collects the k-th furthest outlier; those
-left over drive at GCM + r_a sqrt(N) Rot(theta_k) unit(GCM - goal), theta_k = (k - (M - 1) / 2) 35 degrees.
+For M shepherds (the V formation of Fujioka 2018, distinct outliers): shepherd k collects the k-th furthest outlier;
+those left over drive at GCM + r_a sqrt(N) Rot(theta_k) unit(GCM - goal), theta_k = (k - (M - 1) / 2) 35 degrees.
 
 At this scale (r_a = 0.4 m, shepherds felt at 10 m) the r_a-scaled stand-offs stand inside the flock and scatter it. The
 tuned controller keeps the two modes and the V and adds what the method as published has no answer to:

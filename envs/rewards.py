@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Literal, Protocol
 
+import numba
 import numpy as np
 from pydantic import Field
 
@@ -31,6 +32,19 @@ class Term(Protocol):
     def __call__(self, before: WorldState, after: WorldState, scan: Scan | None, scenario: Scenario) -> float:
         """The term's value at this step, before its weight."""
         ...
+
+
+@numba.njit(cache=True)
+def _occluding(sheep: Floats, goal: Floats, alpha: float, influence: float) -> Floats:
+    """Beams (P,) with the sheep's reading (P, B) in [alpha, min(goal's, influence)]; nothing seen reads infinity."""
+    counts = np.zeros(len(sheep))
+    for p in range(len(sheep)):
+        count = 0
+        for b in range(sheep.shape[1]):
+            s, g = sheep[p, b], goal[p, b]
+            count += 1 if (s >= alpha) & (s <= influence) & (s <= g) & (g < np.inf) else 0
+        counts[p] = count
+    return counts
 
 
 @settings
@@ -87,9 +101,8 @@ class Occlusion(Settings):
         if scan is None:
             raise ValueError("the occlusion term needs a scan")
         sheep, goal = scan[self.scans[0]], scan["goal"]
-        # nothing seen reads infinity, which is beyond every bound
-        counts = (sheep >= self.alpha) & (sheep <= self.influence) & (sheep <= goal) & (goal < np.inf)
-        return np.asarray(counts.sum(axis=1) / scenario.n_steps)
+        counted: Floats = _occluding(sheep, goal, self.alpha, self.influence) / scenario.n_steps
+        return counted
 
     def __call__(self, before: WorldState, after: WorldState, scan: Scan | None, scenario: Scenario) -> float:
         """Mean of the shares, 0 where there is no shepherd."""

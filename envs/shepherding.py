@@ -32,8 +32,8 @@ class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     ## Description
 
-    Sheep are discs in a 2-D physics engine; they graze until a shepherd comes within 10 m and then move by the rules of
-    Strombom et al. (2014). P shepherds see them by lidar only. One env is one team: an observation row and an
+    Sheep are discs in a 2-D physics engine; they graze until a shepherd comes within 10 m and then move by the rules
+    of Strombom et al. (2014). P shepherds see them by lidar only. One env is one team: an observation row and an
     action row a shepherd, one reward for all. The world is that of "Perception-Based Rewards for Robotic Shepherd
     Teams Maneuvering Split Flocks"; everything about it is set by a `shepherd_phys.scenario.Scenario`.
 
@@ -73,7 +73,8 @@ class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     ## Starting state
 
-    Goal and shepherds are uniform in a 50 m box; each flock's centre lies at a uniform bearing, 10-20 m from the goal's.
+    Goal and shepherds are uniform in a 50 m box; each flock's centre lies at a uniform bearing, 10-20 m from the
+    goal's.
     ``reset(seed=s)`` replays an episode exactly.
 
     ## End of an episode
@@ -83,9 +84,9 @@ class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     ## Info
 
-    Scalars under the same keys at every step: ``in_goal`` and ``ever_in_goal`` (fractions of the sheep), ``path_length`` (mean
-    over the shepherds [m]), ``collisions`` (new contacts since reset), ``is_success`` (95 % in now), ``reward/<name>``
-    (weighted; they add up to the reward), ``share/<name>/<k>`` (shepherd k's own share of a term that has shares).
+    Scalars under the same keys at every step: ``in_goal`` and ``ever_in_goal`` (fractions of the sheep),
+    ``path_length`` (mean over the shepherds [m]), ``collisions`` (new contacts since reset), ``is_success`` (95 % in
+    now), ``reward/<name>`` (weighted; they add up to the reward), ``share/<name>/<k>`` (shepherd k's own share of a term that has shares).
 
     ## Arguments
 
@@ -206,8 +207,9 @@ class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         for name, (weight, term) in self._scheme.items():
             if name in self._share_keys:
                 shares = term.shares(before, after, self._scan, self.scenario)  # type: ignore[attr-defined]
-                value = float(shares.mean()) if len(shares) else 0.0
-                info.update(zip(self._share_keys[name], shares.tolist(), strict=True))
+                own = shares.tolist()
+                value = sum(own) / max(len(own), 1)
+                info.update(zip(self._share_keys[name], own, strict=True))
             else:
                 value = term(before, after, self._scan, self.scenario)
             weighted = float(weight * value)
@@ -218,7 +220,7 @@ class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         truncated = after.step >= self.scenario.n_steps
         return self._observe(), reward, terminated, truncated, info
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8] | None:
         """A picture (height, width, 3) of the state, or None without a render mode."""
         if self.render_mode is None:
             return None
@@ -248,7 +250,7 @@ class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         return {
             "in_goal": in_goal,
             "ever_in_goal": int(np.count_nonzero(state.sheep_arrived)) / n,
-            "path_length": float(state.shepherd_path.mean()) if state.n_shepherds else 0.0,
+            "path_length": sum(state.shepherd_path.tolist()) / max(state.n_shepherds, 1),
             "collisions": state.collisions,
             "is_success": in_goal >= SUCCESS_FRACTION,
         }
@@ -268,5 +270,7 @@ def _scheme(rewards: Scheme | str) -> Scheme:
         ) from None
     for name, (weight, term) in scheme.items():
         if not callable(term) or not np.isfinite(weight):
-            raise SettingsError(f"rewards[{name!r}]: needs a finite weight and a callable term (given: {weight}, {term!r})")
+            raise SettingsError(
+                f"rewards[{name!r}]: needs a finite weight and a callable term (given: {weight}, {term!r})"
+            )
     return scheme

@@ -1,6 +1,6 @@
 """``shepherd-phys benchmark``: how fast the simulator is, as ratios measured side by side in one run.
 
-The load is driving: the ``strombom`` team at work on one flock of 100 sheep, counted while at least half of the sheep are
+The load is driving: the ``strombom`` team at work on one flock of 100 sheep, counted while at least half of them are
 threatened. A full step is the environment's: flock, engine, 3 x 3 x 512 beams, observation, ``wild`` rewards with
 their extra scan. One core.
 """
@@ -90,9 +90,8 @@ class Driven:
         """Begin an episode; its Space is new, so its stopwatch is, too."""
         self._reset(seed)
         self.team.reset(self.world.user_rng)
-        assert self.world.space is not None
         self.engine = Stopwatch(self.world.space.step)
-        self.world.space.step = self.engine  # type: ignore[method-assign, assignment]
+        self.world.space.step = self.engine  # type: ignore[method-assign]
 
     def advance(self) -> tuple[float, float]:
         """One control step: seconds of the whole, and of the engine in it."""
@@ -213,7 +212,8 @@ def scaling(counts: tuple[int, ...] = (100, 1_000, 10_000)) -> dict[str, float]:
 
 def overlaps(scenario: Scenario, n_steps: int = 1_500) -> dict[str, float]:
     """How deep sheep are in one another and in shepherds while driven, at the end of each control step [m]."""
-    world, team, deepest, seed = World(scenario), StrombomTeam(), [], SEED
+    world, team, seed = World(scenario), StrombomTeam(), SEED
+    deepest: list[float] = []
     while len(deepest) < n_steps:
         world.reset(seed)
         team.reset(world.user_rng)
@@ -307,7 +307,10 @@ def main(argv: list[str]) -> int:
             shown = f"{value:.4g}" if isinstance(value, float) else value
             if isinstance(value, dict):
                 shown = ", ".join(f"{k}: {v:.4g}" for k, v in value.items())
-            print(f"{key:28} {shown}" if not isinstance(result, list) else f"{key}={shown}", end="  " if isinstance(result, list) else "\n")
+            print(
+                f"{key:28} {shown}" if not isinstance(result, list) else f"{key}={shown}",
+                end="  " if isinstance(result, list) else "\n",
+            )
         if isinstance(result, list):
             print()
     return 0

@@ -64,8 +64,8 @@ def impacts(count: int, seed: int, **engine: int) -> dict[str, Any]:
     n_sheep = sum(who == "sheep" for _, _, who in bodies)
     charge = _Charge(np.zeros((n_sheep, 2)))
     scenario = Scenario(
-        n_sheep=n_sheep, n_flocks=1, shepherds=len(order) - n_sheep, flock=charge, obstacles=obstacles, **engine
-    )
+        n_sheep=n_sheep, n_flocks=1, shepherds=len(order) - n_sheep, flock=charge, obstacles=obstacles
+    ).but(**engine)
     world = World(scenario)
     # the template only lends its shape; every position is set below
     blank = _blank(scenario)
@@ -115,9 +115,7 @@ def impacts(count: int, seed: int, **engine: int) -> dict[str, Any]:
             now = np.concatenate([state.sheep_pos, state.shepherd_pos]) - centers[lane_of]
             away = np.where(is_wall, np.abs(now[:, 0]), np.hypot(now[:, 0], now[:, 1]))
             # far side: of a wall by the sign of x; of a pillar where one step leads to the opposite of where it was
-            crossed = np.where(
-                is_wall, np.sign(now[:, 0]) != side[lane_of], (now * previous).sum(axis=1) < 0.0
-            )
+            crossed = np.where(is_wall, np.sign(now[:, 0]) != side[lane_of], (now * previous).sum(axis=1) < 0.0)
             near = away < half + body_radius + 1e-2
             hit |= near
             through |= (away < half) | (crossed & (np.abs(now[:, 1]) < HALF_WALL) & (np.abs(previous[:, 0]) < 2.0))

@@ -49,7 +49,9 @@ class PlainWorld:
         self.space = pymunk.Space()
         self.space.iterations = scenario.iterations
         self.space.collision_slop = scenario.collision_slop
-        self.sheep = [self._disc(scenario.sheep, p, v, 0) for p, v in zip(state.sheep_pos, state.sheep_vel, strict=True)]
+        self.sheep = [
+            self._disc(scenario.sheep, p, v, 0) for p, v in zip(state.sheep_pos, state.sheep_vel, strict=True)
+        ]
         self.shepherds = [
             self._disc(body, p, v, k + 1)
             for k, (body, p, v) in enumerate(
@@ -99,7 +101,7 @@ class PlainWorld:
                 length = np.hypot(acceleration[0], acceleration[1])
                 if length > scenario.max_acceleration:
                     acceleration *= scenario.max_acceleration / length
-                body.force = tuple(float(a) * body.mass for a in acceleration)
+                body.force = float(acceleration[0]) * body.mass, float(acceleration[1]) * body.mass
             self.space.step(h)
         pos = np.array([tuple(b.position) for b in self.sheep])
         vel = np.array([tuple(b.velocity) for b in self.sheep])
@@ -153,7 +155,7 @@ class PlainWorld:
         names = {"sheep": WILD | TAME, "shepherds": SHEPHERD, "wild": WILD}
         ranges = {name: np.full((len(self.shepherds), beams), np.inf) for name in (*names, "goal")}
         for k, body in enumerate(self.shepherds):
-            start = tuple(body.position)
+            start = (body.position.x, body.position.y)
             for name, mask in names.items():
                 shape_filter = pymunk.ShapeFilter(group=k + 1, mask=mask)
                 for b, (cos, sin) in enumerate(self.beams):
@@ -183,6 +185,4 @@ class PlainWorld:
         distance = (1.0 + np.maximum(away[outside] - self.scenario.goal_radius, 0.0)).sum() / (n * t)
         seen, goal = ranges["wild"], ranges["goal"]
         occluded = np.isfinite(goal) & (seen >= 2.0) & (seen <= np.minimum(goal, 10.0))
-        return float(
-            10 * inside.sum() / (n * t) - 0.1 * distance + 0.1 * occluded.sum() / (len(self.shepherds) * t)
-        )
+        return float(10 * inside.sum() / (n * t) - 0.1 * distance + 0.1 * occluded.sum() / (len(self.shepherds) * t))

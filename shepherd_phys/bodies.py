@@ -30,9 +30,7 @@ class Body(Protocol):
         """A fresh dynamic body with its mass, and its shapes."""
         ...
 
-    def follow(
-        self, pose: NDArray[np.float64], wanted: NDArray[np.float64], dt: float
-    ) -> tuple[Any, float]:
+    def follow(self, pose: NDArray[np.float64], wanted: NDArray[np.float64], dt: float) -> tuple[Any, float]:
         """Turn what is wanted into what this body does next, once a substep.
 
         Args:

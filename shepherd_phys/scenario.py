@@ -64,8 +64,8 @@ class Scenario(Settings):
     """R [m]."""
     goal_pos: tuple[float, float] | None = None
     """Centre g of the goal [m]; drawn uniformly from the box where None."""
-    shepherds: Annotated[tuple[Any, ...], BeforeValidator(_team)] = (Disc(), Disc(), Disc())
-    """One body a shepherd; a number means that many default discs."""
+    shepherds: Annotated[Any, BeforeValidator(_team)] = (Disc(), Disc(), Disc())
+    """A tuple with one body a shepherd; given a number, that many default discs."""
     sheep: Any = SHEEP
     """The sheep's body."""
     flock: Any = Strombom()

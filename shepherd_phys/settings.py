@@ -30,9 +30,7 @@ def settings(cls: type[T]) -> type[T]:
 
     NaN and infinities are refused in every float field.
     """
-    config = ConfigDict(
-        extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True, validate_default=True
-    )
+    config = ConfigDict(extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True, validate_default=True)
     decorated = pydantic.dataclasses.dataclass(frozen=True, config=config)(cls)
     validating_init = decorated.__init__
 

@@ -101,7 +101,7 @@ def centroid(points: Floats) -> Floats:
 def unit(vectors: Floats) -> Floats:
     """Vectors (..., 2) scaled to length 1; a vector of length 0 stays 0."""
     length = np.hypot(vectors[..., 0], vectors[..., 1])[..., None]
-    return np.divide(vectors, length, out=np.zeros_like(vectors, dtype=float), where=length > 0)
+    return np.asarray(np.divide(vectors, length, out=np.zeros_like(vectors, dtype=float), where=length > 0))
 
 
 @numba.njit(cache=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numba
@@ -24,11 +25,12 @@ from shepherd_phys.geometry import (
     SHEEP_CATEGORY,
     SHEPHERD_CATEGORY,
     SHEPHERDS,
+    Geometry,
     compile_shapes,
 )
 from shepherd_phys.lidar import Lidar, Scan, Sensor
 from shepherd_phys.obstacles import solid
-from shepherd_phys.placement import place, relax
+from shepherd_phys.placement import PlacementError, flock_of, place, relax
 from shepherd_phys.scenario import Scenario
 from shepherd_phys.settings import Foreign, SettingsError, kind_of
 from shepherd_phys.state import Floats, WorldState, frozen
@@ -39,8 +41,13 @@ SHEEP_SETS = {
 }
 """Sheep that can be scanned on their own: never been in the goal; outside it now."""
 
-RELAX_SWEEPS = 2_000
-"""Sweeps after which placing gives up; 100 sheep at the paper's density need a few dozen."""
+RELAX_SWEEPS = 1_000
+"""Sweeps after which placing gives up: 100 sheep at the paper's density need about 15, 10,000 about 350."""
+
+PLACE_TRIES = 200
+"""Draws of a placement among obstacles after which it is given up."""
+CLEARANCE = 1e-3
+"""Gap that placing leaves between a body and an obstacle [m]."""
 
 _LINEAR = batch.BodyFields.POSITION | batch.BodyFields.VELOCITY
 _POSES = _LINEAR | batch.BodyFields.ANGLE | batch.BodyFields.ANGULAR_VELOCITY
@@ -62,6 +69,7 @@ class World:
     Attributes:
         scenario: the same.
         state: the latest `WorldState`; `reset` makes the first.
+        space: the pymunk Space of this episode, to look at.
         user_rng: generator for controllers and users, seeded by `reset` apart from the world's own.
     """
 
@@ -72,12 +80,8 @@ class World:
         if not hasattr(scenario.flock, "velocities"):
             raise SettingsError(f"flock ({kind_of(scenario.flock)}): a flock model needs 'velocities'")
         self.scenario = scenario
-        self.space: pymunk.Space | None = None
         self._n = scenario.n_sheep
         self._p = scenario.n_shepherds
-        # batch buffers are never freed by pymunk: made once, used by every Space of this world
-        self._read_buffer = batch.Buffer()
-        self._write_buffer = batch.Buffer()
         self._state: WorldState | None = None
 
     @property
@@ -105,21 +109,29 @@ class World:
         scenario = self.scenario
         placement = self._seed(seed)
         bodies, static = self._new_bodies()
-        goal, sheep_pos, shepherd_pos = place(
-            placement,
-            n_sheep=self._n,
-            n_flocks=scenario.n_flocks,
-            flock_distance=scenario.flock_distance,
-            flock_sd=scenario.flock_sd,
-            n_shepherds=self._p,
-            box=scenario.box,
-            goal_pos=scenario.goal_pos,
-        )
         solids = compile_shapes([(shape, -1, OBSTACLES) for shape in static])
+        for _ in range(PLACE_TRIES):
+            goal, sheep_pos, shepherd_pos = place(
+                placement,
+                n_sheep=self._n,
+                n_flocks=scenario.n_flocks,
+                flock_distance=scenario.flock_distance,
+                flock_sd=scenario.flock_sd,
+                n_shepherds=self._p,
+                box=scenario.box,
+                goal_pos=scenario.goal_pos,
+            )
+            if not static or self._has_room(solids, goal, sheep_pos, shepherd_pos):
+                break
+        else:
+            raise PlacementError(
+                f"obstacles: in {PLACE_TRIES} draws they left no room for the goal, a shepherd or the middle of a flock; "
+                "fewer or smaller ones, a larger box or another goal_pos make some"
+            )
         pos = relax(
             np.concatenate([sheep_pos, shepherd_pos]),
             np.array([reach for _, _, reach in bodies]),
-            push_out=(lambda at, radius: push_out(solids, at, radius)) if static else None,
+            push_out=partial(_out_of, solids) if static else None,
             max_sweeps=RELAX_SWEEPS,
         )
         angle = self._noise.uniform(0.0, 2 * np.pi, self._n)
@@ -133,6 +145,16 @@ class World:
             np.stack([np.cos(angle), np.sin(angle)], axis=1),
             np.zeros(self._n, dtype=np.bool_),
         )
+
+    def _has_room(self, solids: Geometry, goal: Floats, sheep_pos: Floats, shepherd_pos: Floats) -> bool:
+        """Whether obstacles leave the goal free (its centre, where it is given), shepherds and flocks' middles, too."""
+        flock = flock_of(self._n, self.scenario.n_flocks)
+        middles = np.array([sheep_pos[flock == k].mean(axis=0) for k in range(self.scenario.n_flocks)])
+        points = np.concatenate([goal[None], shepherd_pos, middles])
+        wanted = np.zeros(len(points))
+        if self.scenario.goal_pos is None:
+            wanted[0] = self.scenario.goal_radius
+        return bool((solids.static_distances(points)[0].min(axis=1) > wanted).all())
 
     def reset_to(self, state: WorldState, seed: int) -> WorldState:
         """Start an episode from a given arrangement instead of a drawn one.
@@ -192,9 +214,8 @@ class World:
         heading: Floats,
         arrived: NDArray[np.bool_],
     ) -> WorldState:
-        """Put everything into the Space and read the first state; ``motion`` rows are x, y, angle, vx, vy, spin."""
+        """Fill the Space and read the first state; rows of ``motion`` are x, y, angle, vx, vy, spin."""
         scenario, space = self.scenario, self.space
-        assert space is not None  # _new_bodies made it
         self._shapes: list[tuple[pymunk.Shape, int, int]] = []
         for row, (body, shapes, _) in enumerate(bodies):
             is_sheep = row < self._n
@@ -237,6 +258,10 @@ class World:
         n_rows = n + p + (1 if static else 0)
         self._command = np.zeros((n + p, 3))
         self._force = np.zeros((n_rows, 3 if self._spins else 2))
+        if self._state is None:
+            # pymunk never frees batch buffers: made once and used by every Space of this world; not before the first
+            # reset, so that a fresh world can be pickled
+            self._read_buffer, self._write_buffer = batch.Buffer(), batch.Buffer()
         self._write_buffer.set_float_buf(self._force)
         self._fields = _POSES if self._spins else _LINEAR
         self._force_fields = batch.BodyFields.FORCE | batch.BodyFields.TORQUE if self._spins else batch.BodyFields.FORCE
@@ -262,7 +287,6 @@ class World:
         """
         state, scenario = self.state, self.scenario
         space = self.space
-        assert space is not None  # a state implies a Space
         action = np.asarray(action, dtype=np.float64)
         if action.shape != (self._p, 2):
             raise ValueError(f"action: needs shape ({self._p}, 2), one row a shepherd (given: {action.shape})")
@@ -297,7 +321,12 @@ class World:
                 rows = self._read()
 
         self._state = self._measure(
-            self._read(), state.step + 1, state.sheep_heading, state.sheep_arrived, state.shepherd_pos, state.shepherd_path
+            self._read(),
+            state.step + 1,
+            state.sheep_heading,
+            state.sheep_arrived,
+            state.shepherd_pos,
+            state.shepherd_path,
         )
         return self._state
 
@@ -310,7 +339,9 @@ class World:
             followed[row, 0], followed[row, 1] = velocity
             followed[row, 2] = spin
             if not all(map(math.isfinite, followed[row])):
-                raise NonFiniteError(f"{type(body).__name__}.follow: velocity {velocity} and spin {spin} must be finite")
+                raise NonFiniteError(
+                    f"{type(body).__name__}.follow: velocity {velocity} and spin {spin} must be finite"
+                )
         return followed
 
     def _read(self) -> Floats:
@@ -328,13 +359,17 @@ class World:
         self, rows: Floats, step: int, heading: Floats, arrived: NDArray[np.bool_], previous: Floats, path: Floats
     ) -> WorldState:
         """Make the state of what was read."""
-        scenario = self.scenario
-        finite, pos, vel, heading, distance, inside, ever, shepherds, shepherds_vel, angle, walked = _measure(
-            rows, self._n, self._p, self._command, heading, arrived, previous, path, self._goal, scenario.goal_radius
-        )
-        if not finite:
+        scenario, n, p = self.scenario, self._n, self._p
+        # allocated here and not in the kernel: handing arrays over costs less than bringing them back
+        pos, vel, turned, distance = np.empty((n, 2)), np.empty((n, 2)), np.empty((n, 2)), np.empty(n)
+        inside, ever = np.empty(n, np.bool_), np.empty(n, np.bool_)
+        at, at_vel, angle, walked = np.empty((p, 2)), np.empty((p, 2)), np.empty(p), np.empty(p)
+        if not _measure(
+            rows, self._command, heading, arrived, previous, path, self._goal, scenario.goal_radius,
+            pos, vel, turned, distance, inside, ever, at, at_vel, angle, walked,
+        ):  # fmt: skip
             raise NonFiniteError("the engine gave positions or velocities that are not finite")
-        for array in (pos, vel, heading, distance, inside, ever, shepherds, shepherds_vel, angle, walked):
+        for array in (pos, vel, turned, distance, inside, ever, at, at_vel, angle, walked):
             array.flags.writeable = False
         return WorldState(
             step,
@@ -343,14 +378,14 @@ class World:
             scenario.goal_radius,
             pos,
             vel,
-            heading,
+            turned,
             distance,
             inside,
             ever,
             self._radius[0],
             self._sheep_speed,
-            shepherds,
-            shepherds_vel,
+            at,
+            at_vel,
             angle,
             self._radius[1],
             self._speed,
@@ -381,6 +416,16 @@ class World:
         masks: Mapping[str, NDArray[np.bool_]] = {name: SHEEP_SETS[name](state) for name in sets}
         poses = _poses(self._rows, self._n + self._p, self._spins)
         return sensor.scan(poses, state.goal_pos, state.goal_radius, masks)
+
+
+def _out_of(solids: Geometry, pos: Floats, radius: Floats) -> Floats:
+    """Bodies (M, 2) moved out of the obstacle that each is deepest in, just clear of it."""
+    distance, away = solids.static_distances(pos)
+    depth = radius[:, None] - distance
+    deepest = depth.argmax(axis=1)
+    rows = np.arange(len(pos))
+    by = depth[rows, deepest]
+    return np.asarray(pos + np.where(by > 0, by + CLEARANCE, 0.0)[:, None] * away[rows, deepest])
 
 
 @numba.njit(cache=True)
@@ -424,12 +469,14 @@ def _servo(rows, command, mass, moment, h, limit, spin_limit, spins, force):  # 
 
 
 @numba.njit(cache=True)
-def _measure(rows, n, p, command, heading, arrived, previous, path, goal, goal_radius):  # type: ignore[no-untyped-def]
-    """Positions, velocities, headings, distances to the goal, who is in it, and what the shepherds walked."""
+def _measure(  # type: ignore[no-untyped-def]
+    rows, command, heading, arrived, previous, path, goal, goal_radius,
+    pos, vel, turned, distance, inside, ever, at, at_vel, angle, walked,
+):  # fmt: skip
+    """Write positions, velocities, headings, distances to the goal, who is in it, what shepherds walked; all finite?"""
+    n, p = len(pos), len(at)
     spins = rows.shape[1] == 6
     v = 3 if spins else 2
-    pos, vel, turned = np.empty((n, 2)), np.empty((n, 2)), np.empty((n, 2))
-    distance, inside, ever = np.empty(n), np.empty(n, np.bool_), np.empty(n, np.bool_)
     total = 0.0  # not finite as soon as one of its terms is not
     for i in range(n):
         x, y = rows[i, 0], rows[i, 1]
@@ -438,23 +485,21 @@ def _measure(rows, n, p, command, heading, arrived, previous, path, goal, goal_r
         total += x + y + vel[i, 0] + vel[i, 1]
         # a sheep that stands still keeps the direction that it was last commanded
         cx, cy = command[i, 0], command[i, 1]
-        length = math.hypot(cx, cy)
+        length = math.sqrt(cx * cx + cy * cy)
         turned[i, 0] = cx / length if length > 0.0 else heading[i, 0]
         turned[i, 1] = cy / length if length > 0.0 else heading[i, 1]
-        d = math.hypot(x - goal[0], y - goal[1])
+        d = math.sqrt((x - goal[0]) ** 2 + (y - goal[1]) ** 2)
         inside[i] = d <= goal_radius
         distance[i] = max(d - goal_radius, 0.0)
         ever[i] = arrived[i] or inside[i]
-    shepherds, shepherds_vel, angle, walked = np.empty((p, 2)), np.empty((p, 2)), np.zeros(p), np.empty(p)
     for k in range(p):
         x, y = rows[n + k, 0], rows[n + k, 1]
-        shepherds[k, 0], shepherds[k, 1] = x, y
-        shepherds_vel[k, 0], shepherds_vel[k, 1] = rows[n + k, v], rows[n + k, v + 1]
-        if spins:
-            angle[k] = rows[n + k, 2]
-        total += x + y + shepherds_vel[k, 0] + shepherds_vel[k, 1] + angle[k]
-        walked[k] = path[k] + math.hypot(x - previous[k, 0], y - previous[k, 1])
-    return math.isfinite(total), pos, vel, turned, distance, inside, ever, shepherds, shepherds_vel, angle, walked
+        at[k, 0], at[k, 1] = x, y
+        at_vel[k, 0], at_vel[k, 1] = rows[n + k, v], rows[n + k, v + 1]
+        angle[k] = rows[n + k, 2] if spins else 0.0
+        total += x + y + at_vel[k, 0] + at_vel[k, 1] + angle[k]
+        walked[k] = path[k] + math.sqrt((x - previous[k, 0]) ** 2 + (y - previous[k, 1]) ** 2)
+    return math.isfinite(total)
 
 
 @numba.njit(cache=True)

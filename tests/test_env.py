@@ -168,9 +168,7 @@ def test_the_stack_is_filled_by_the_first_frame_and_then_moves():
 
 
 def test_goal_frame_rolls_by_beam_offset_and_leaves_actions_alone():
-    plain, turned = (
-        ShepherdingEnv("small", lidar=lidar) for lidar in (Lidar(), Lidar(frame="goal"))
-    )
+    plain, turned = (ShepherdingEnv("small", lidar=lidar) for lidar in (Lidar(), Lidar(frame="goal")))
     a, b = plain.reset(seed=2)[0], turned.reset(seed=2)[0]
     for _ in range(5):
         for p in range(2):

@@ -58,7 +58,8 @@ def test_occlusion_counts_beams_at_a_useful_distance():
     assert line_up(5.0) == expected == 5
     assert line_up(1.5) == 0  # nearer than alpha: in the flock
     assert line_up(1.5, alpha=1.0) > 0
-    assert line_up(7.9) > 0
+    assert line_up(7.6) > 0  # any nearer to the goal and the sheep has arrived: no longer wild
+    assert line_up(7.9) == 0 < line_up(7.9, sheep="any")
     assert line_up(11.0, goal_distance=20.0) == 0  # beyond the radius of influence
     assert line_up(11.0, goal_distance=20.0, influence=12.0) > 0
     assert line_up(9.0) == 0  # behind the near side of the goal

@@ -205,8 +205,7 @@ def _with_circle(mass=1.0, moment=math.inf, radius=0.3, kind=pymunk.Body.DYNAMIC
 @pytest.mark.parametrize(
     ("body", "message"),
     [
-        (_body(_with_circle(mass=math.nan)), r"shepherd 0 \(.*Mine\).build: mass must be finite"),
-        (_body(_with_circle(mass=0)), "mass must be finite and above 0"),
+        (_body(_with_circle(mass=0)), r"shepherd 0 \(.*Mine\).build: mass must be finite and above 0"),
         (_body(_with_circle(moment=0)), "moment above 0"),
         (_body(_with_circle(radius=math.nan)), "shapes must be finite"),
         (_body(_with_circle(kind=pymunk.Body.STATIC)), "must be dynamic"),

@@ -171,7 +171,8 @@ def test_path_is_summed_displacement_not_command():
     put(world, [[0, 40]], [[0.0, 0.0]])
     for _ in range(50):
         state = world.step([[1.0, 0.0]])
-    assert state.shepherd_path[0] == pytest.approx(0.7, abs=0.03)
+    # 0.7 m to the wall, a little into it and back; the command was 15 m
+    assert 0.69 < state.shepherd_path[0] < 0.9
 
 
 def test_arrival_is_remembered_and_heading_kept_while_standing():
@@ -297,12 +298,24 @@ def test_bodies_are_placed_clear_of_obstacles():
         assert gap >= 0.8 + 0.15
 
 
+def test_a_drawn_goal_is_clear_of_obstacles_and_a_given_one_may_only_touch_them():
+    wall = Wall((-30, 0), (30, 0))
+    drawn = World(Scenario(n_sheep=4, n_flocks=1, obstacles=(wall,)))
+    assert min(abs(drawn.reset(seed).goal_pos[1]) for seed in range(40)) > 2.5 + 0.05
+    World(Scenario(n_sheep=4, n_flocks=1, goal_pos=(0.0, 1.0), obstacles=(wall,))).reset(0)
+    with pytest.raises(SettingsError, match="obstacles: .*another goal_pos"):
+        World(Scenario(n_sheep=4, n_flocks=1, goal_pos=(0.0, 0.0), obstacles=(wall,))).reset(0)
+
+
 def test_obstacles_that_cover_the_box_are_one_clear_error():
-    block = Polygon(((-60, -60), (60, -60), (60, 60), (-60, 60)))
-    holes = tuple(Pillar((x, y), 4.0) for x in range(-64, 65, 5) for y in range(-64, 65, 5))
-    for obstacles in ((block, *holes), holes):
-        with pytest.raises(SettingsError, match="obstacles"):
-            World(Scenario(n_sheep=100, n_flocks=1, obstacles=obstacles)).reset(0)
+    gaps = tuple(Pillar((x, y), 2.0) for x in range(-12, 13, 3) for y in range(-12, 13, 3))  # they leave no room at all
+    block = Polygon(((-12, -12), (12, -12), (12, 12), (-12, 12)))
+    for obstacles in (gaps, (block, *gaps)):
+        scenario = Scenario(
+            n_sheep=20, n_flocks=1, shepherds=2, box=4.0, flock_distance=(1.0, 2.0), obstacles=obstacles
+        )
+        with pytest.raises(SettingsError, match="obstacles: in 200 draws they left no room"):
+            World(scenario).reset(0)
 
 
 # ----------------------------------------------------------------------- guards
@@ -403,15 +416,15 @@ def test_a_user_body_that_turns_is_read_and_driven():
         def follow(self, pose, wanted, dt):
             nose = np.array([math.cos(pose[2]), math.sin(pose[2])])
             off = math.atan2(nose[0] * wanted[1] - nose[1] * wanted[0], nose @ wanted)
-            return nose * max(0.0, nose @ wanted), float(np.clip(off / dt, -2.0, 2.0))
+            return nose * max(0.0, nose @ wanted), float(np.clip(4 * off, -2.0, 2.0))
 
     world = lone(shepherds=(Cart(), Disc()))
     put(world, [[0, 50]], [[0.0, 0.0], [10.0, 0.0]])
     for _ in range(30):
         state = world.step([[0.0, 1.0], [0.0, 1.0]])
-    assert state.shepherd_angle[0] == pytest.approx(math.pi / 2, abs=0.02)
+    assert state.shepherd_angle[0] == pytest.approx(math.pi / 2, abs=0.05)
     assert state.shepherd_angle[1] == 0.0
-    assert state.shepherd_vel[0] == pytest.approx([0.0, 1.0], abs=0.03)
+    assert state.shepherd_vel[0] == pytest.approx([0.0, 1.0], abs=0.05)
     assert state.shepherd_pos[0, 1] > 4.0
     assert state.shepherd_radius.tolist() == [0.3, 0.25]
 

@@ -1,0 +1,71 @@
+# Everything happens in .venv, which the first target that needs it makes from requirements.lock.
+# `make PYTHON=/path/to/python3.11` names another interpreter.
+
+PYTHON ?= python3.11
+BIN := .venv/bin
+WORKERS ?= 2
+
+# what the caller's own Python set-up must not change
+unexport PYTHONPATH PYTHONHOME PYTHONSTARTUP VIRTUAL_ENV PIP_USER PIP_TARGET PIP_PREFIX
+# the folder shepherd_phys/ of the checkout must not hide the installed package, which also holds envs, controllers, scripts
+export PYTHONSAFEPATH := 1
+
+.DELETE_ON_ERROR:
+.PHONY: help run test test-slow lint format benchmark lock clean .venv FORCE
+
+help:  ## this list
+	@sed -n 's/^\([a-z.-]*\):[^#]*##  *\(.*\)/\1|\2/p' $(MAKEFILE_LIST) | while IFS='|' read -r name text; do printf '  make %-10s %s\n' "$$name" "$$text"; done
+
+run: build/.installed  ## play a few trials of two controllers and write results/
+	$(BIN)/shepherd-phys evaluate --controllers strombom idle --flocks 1 2 --trials 4 --workers $(WORKERS) --out results
+
+test: lint  ## style, types, and the fast tests
+	$(BIN)/pytest -n $(WORKERS) -m "not slow"
+
+test-slow: build/.installed  ## the longer proofs
+	$(BIN)/pytest -n $(WORKERS) -m slow
+
+lint: build/.installed  ## style and types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: build/.installed  ## repair what ruff can repair
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+benchmark: build/.installed  ## measure the speed of the simulator
+	$(BIN)/shepherd-phys benchmark
+
+.venv: build/.installed  ## the whole development environment
+
+# An environment counts as made only once its stamp, written last, is there; anything else is begun anew.
+.venv/.locked: requirements.lock
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || \
+		{ echo "error: this project needs Python 3.11, and '$(PYTHON)' does not run one." \
+		"Install it, or name it: make PYTHON=/path/to/python3.11" >&2; exit 1; }
+	rm -rf .venv
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install -r requirements.lock
+	touch $@
+
+# The editable install links file by file: a file added or removed calls for a new one, an edited file does not.
+build/.files: FORCE
+	@mkdir -p build
+	@find shepherd_phys envs controllers scripts -type f ! -path '*/__pycache__/*' | LC_ALL=C sort > $@.new
+	@if cmp -s $@.new $@; then rm $@.new; else mv $@.new $@; fi
+
+build/.installed: build/.files pyproject.toml .venv/.locked
+	@rm -f $@
+	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable . --config-settings editable_mode=strict
+	@touch $@
+
+lock: build/.installed  ## write requirements.lock anew, keeping the versions it has (UPGRADE=1: the newest)
+	CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/pip-compile --quiet --all-extras --allow-unsafe --strip-extras \
+		--no-build-isolation --no-annotate --no-emit-index-url --no-emit-find-links --no-emit-trusted-host \
+		$(if $(UPGRADE),--upgrade) --output-file requirements.lock pyproject.toml
+	sed -i.old -e 's/+cpu$$//' -e '/^pip==/d' requirements.lock && rm requirements.lock.old
+
+clean:  ## remove everything that was made, results and runs excepted
+	rm -rf .venv build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .benchmarks
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,295 @@
+"""Points of an experiment: a controller in a scenario. From names to points, tasks, episodes and tables.
+
+What `evaluate` and `reproduce` share. It is the place where envs and controllers meet.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import importlib
+import inspect
+import itertools
+import os
+import sys
+from collections.abc import Iterable, Sequence
+from contextlib import redirect_stdout
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from shepherd_phys import __version__
+from shepherd_phys.bodies import BODIES, Body
+from shepherd_phys.campaign import Outcome, Task, settings_hash, write_csv
+from shepherd_phys.controllers import CONTROLLERS, Controller
+from shepherd_phys.controllers.evaluation import (
+    COLUMNS,
+    ControllerError,
+    checked_controller,
+    evaluate,
+    parameters_of,
+)
+from shepherd_phys.controllers.summary import summarise, summary_columns
+from shepherd_phys.envs.shepherding import ShepherdingEnv
+from shepherd_phys.flock import FLOCKS, FlockModel
+from shepherd_phys.scenario import Scenario, load_scenario
+from shepherd_phys.settings import SettingsError, kind_of
+from shepherd_phys.workers import explain
+
+
+@dataclass(frozen=True)
+class Point:
+    """A controller in a scenario, by name, so that it can be sent to a worker."""
+
+    controller: str
+    """A name of `CONTROLLERS`, or ``module:Name``."""
+    scenario_name: str
+    scenario: Scenario
+
+    @property
+    def labels(self) -> dict[str, Any]:
+        """The columns of a row that name the point."""
+        return {
+            "controller": self.controller,
+            "n_flocks": self.scenario.n_flocks,
+            "cohesion": getattr(self.scenario.flock, "n_neighbours", None),
+            "n_shepherds": self.scenario.n_shepherds,
+            "n_sheep": self.scenario.n_sheep,
+            "scenario": self.scenario_name,
+        }
+
+    def __str__(self) -> str:
+        return ", ".join(value if name == "controller" else f"{name} {value}" for name, value in self.labels.items())
+
+    def settings_hash(self) -> str:
+        """Of all that determines a row except its seed, the source of a user's own classes included.
+
+        Raises:
+            SettingsError: the parameters that the controller or a user's own class tells are not plain data.
+        """
+        scenario = self.scenario
+        controller = find_controller(self.controller)
+        things = [controller, scenario.sheep, scenario.flock, *scenario.shepherds, *scenario.obstacles]
+        try:
+            return settings_hash(
+                {
+                    "controller": self.controller,
+                    "parameters": parameters_of(controller),
+                    "scenario": scenario.to_dict(),
+                    "sources": {kind_of(thing): source_hash(thing) for thing in things if ":" in kind_of(thing)},
+                    "version": __version__,
+                }
+            )
+        except (TypeError, ValueError) as error:
+            raise SettingsError(f"{self}: parameters must be plain data and finite ({error})") from None
+
+
+def points(
+    *,
+    controllers: Sequence[str],
+    scenario: str = "paper",
+    flocks: Sequence[int] = (),
+    cohesion: Sequence[int] = (),
+    shepherds: Sequence[int] = (),
+    sheep: int | None = None,
+    body: str | None = None,
+    flock: str | None = None,
+) -> list[Point]:
+    """Every combination; what is left out is the scenario's.
+
+    Args:
+        controllers: names, or ``module:Name`` of a user's own.
+        scenario: a preset's name or a TOML file.
+        flocks: numbers of flocks.
+        cohesion: n, neighbours in the flock model's cohesion.
+        shepherds: numbers of shepherds.
+        sheep: N.
+        body: of all shepherds, a name of `BODIES` or ``module:Name``.
+        flock: how sheep move, a name of `FLOCKS` or ``module:Name``.
+
+    Raises:
+        SettingsError: something is unknown or impossible; the message names it.
+        ControllerError: an object given as controller is none.
+    """
+    for name in controllers:
+        find_controller(name)
+    body_class = None if body is None else find_class(body, BODIES, Body, "body")
+    flock_class = None if flock is None else find_class(flock, FLOCKS, FlockModel, "flock")
+    classes = [cls for cls in (body_class, flock_class) if cls is not None]
+    base = load_scenario(scenario, classes)
+    if sheep is not None:
+        # with the number of flocks, which is checked against it
+        base = base.but(n_sheep=sheep, n_flocks=min(base.n_flocks, sheep) if flocks else base.n_flocks)
+    if flock_class is not None:
+        base = base.but(flock=_made(flock_class, "flock"))
+    if body_class is not None:
+        base = base.but(shepherds=(_made(body_class, "body"),) * base.n_shepherds)
+    shown = Path(scenario).name
+    found = []
+    lists = [dict.fromkeys(values) or [None] for values in (flocks, cohesion, shepherds)]  # nothing twice
+    for name, n_flocks, n_neighbours, n_shepherds in itertools.product(dict.fromkeys(controllers), *lists):
+        changes: dict[str, Any] = {}
+        if n_flocks is not None:
+            changes["n_flocks"] = n_flocks
+        if n_neighbours is not None:
+            changes["flock"] = _with_neighbours(base.flock, n_neighbours)
+        if n_shepherds is not None:
+            changes["shepherds"] = _team(base, n_shepherds)
+        found.append(Point(name, shown, base.but(**changes)))
+    return found
+
+
+def tasks(points: Iterable[Point], seeds: Sequence[int]) -> list[Task]:
+    """One task a point and seed, seed by seed, so that an unfinished campaign knows something about every point.
+
+    Raises:
+        SettingsError: an env cannot be made for a point.
+    """
+    hashed = []
+    for point in points:
+        ShepherdingEnv(point.scenario, rewards={}, lidar=find_controller(point.controller).lidar).close()
+        hashed.append((point.settings_hash(), point))
+    return [Task(name, seed, point, str(point)) for seed in seeds for name, point in hashed]
+
+
+def place(point: Point, seeds: Sequence[int]) -> None:
+    """Place a point's world on one of the seeds.
+
+    Raises:
+        SettingsError: it cannot be placed on any.
+    """
+    env = ShepherdingEnv(point.scenario, rewards={}, lidar=None)
+    for i, seed in enumerate(seeds, start=1):
+        try:
+            env.reset(seed=seed)
+            return
+        except SettingsError:
+            if i == len(seeds):
+                raise
+
+
+def episode(point: Point, seed: int) -> dict[str, Any]:
+    """Run one episode of a point: the work of a campaign."""
+    row = evaluate(find_controller(point.controller), partial(ShepherdingEnv, point.scenario), [seed])[0]
+    del row["controller"]  # the point has the name by which it was asked for
+    return row
+
+
+def table(tasks: Sequence[Task], outcome: Outcome) -> list[dict[str, Any]]:
+    """The rows of ``episodes.csv`` for the tasks that have one, sorted by point and seed."""
+    rows = [
+        {**task.spec.labels, **row, "seed": task.seed, "settings_hash": task.settings_hash, "version": __version__}
+        for task, row in zip(tasks, outcome.rows, strict=True)
+        if row is not None
+    ]
+    return sorted(rows, key=lambda row: tuple(_sortable(row[name]) for name in COLUMNS))
+
+
+def write_tables(folder: Path, rows: Sequence[dict[str, Any]]) -> tuple[list[dict[str, Any]], list[Path]]:
+    """Write ``episodes.csv`` and ``summary.csv``; the summary's rows and the two paths."""
+    summary = summarise(rows)
+    paths = [folder / "episodes.csv", folder / "summary.csv"]
+    write_csv(paths[0], COLUMNS, rows)
+    write_csv(paths[1], summary_columns(), summary)
+    return summary, paths
+
+
+def find_controller(name: str) -> Controller:
+    """A fresh controller by its name or ``module:Name``.
+
+    Raises:
+        SettingsError: there is none of this name.
+        ControllerError: the object is no controller.
+    """
+    if ":" in name:
+        own = imported(name, "controllers")
+        if inspect.isroutine(own):  # a function that makes one
+            try:
+                own = own()
+            except TypeError as error:
+                raise ControllerError(f"controllers: {name}: cannot be called without arguments ({error})") from None
+        return checked_controller(own)
+    if name not in CONTROLLERS:
+        raise SettingsError(
+            f"controllers: {name!r} is unknown; there are {', '.join(sorted(CONTROLLERS))}, or module:Name of your own"
+        )
+    return CONTROLLERS[name]()
+
+
+def find_class(name: str, known: dict[str, type[Any]], protocol: type[Any], where: str) -> type[Any]:
+    """A class by its name among ``known`` or by ``module:Name``.
+
+    Raises:
+        SettingsError: there is none, or it lacks something that ``protocol`` asks for.
+    """
+    if ":" not in name:
+        if name not in known:
+            raise SettingsError(
+                f"{where}: {name!r} is unknown; there are {', '.join(sorted(known))}, or module:Name of your own"
+            )
+        return known[name]
+    own = imported(name, where)
+    if not inspect.isclass(own):
+        raise SettingsError(f"{where}: {name}: needs a class (it is a {type(own).__name__})")
+    made = _made(own, where)
+    lacking = [member for member in vars(protocol) if not member.startswith("_") and not hasattr(made, member)]
+    if lacking:
+        raise SettingsError(f"{where}: {name}: lacks {', '.join(lacking)}")
+    return own
+
+
+def imported(name: str, where: str) -> Any:
+    """The object ``module:Name``, its module found from the current directory too.
+
+    Raises:
+        SettingsError: it cannot be imported, or the module lacks it.
+    """
+    module_name, _, attribute = name.partition(":")
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())  # at the end: it must not hide an installed package, ours in a checkout included
+    try:
+        with redirect_stdout(sys.stderr):  # standard output may be for JSON
+            module = importlib.import_module(module_name)
+    except Exception as error:
+        raise SettingsError(f"{where}: {name}: module {module_name!r} cannot be imported: {explain(error)}") from None
+    if not hasattr(module, attribute):
+        raise SettingsError(f"{where}: {name}: module {module_name!r} has no {attribute!r}")
+    return getattr(module, attribute)
+
+
+def source_hash(thing: Any) -> str | None:
+    """SHA-256 of the file that holds the object's class: an edited class must not find the rows of the old one."""
+    try:
+        path = inspect.getsourcefile(thing if inspect.isclass(thing) or inspect.isroutine(thing) else type(thing))
+        return hashlib.sha256(Path(path or "").read_bytes()).hexdigest()
+    except (TypeError, OSError):
+        return None
+
+
+def _made(cls: type[Any], where: str) -> Any:
+    try:
+        return cls()
+    except TypeError as error:
+        raise SettingsError(f"{where}: {cls.__name__}: cannot be made without arguments ({error})") from None
+
+
+def _with_neighbours(flock: Any, n: int) -> Any:
+    if not hasattr(flock, "n_neighbours"):
+        raise SettingsError(f"cohesion: the flock model {kind_of(flock)} has no n_neighbours to set (given: {n})")
+    if hasattr(flock, "but"):
+        return flock.but(n_neighbours=n)
+    return dataclasses.replace(flock, n_neighbours=n)
+
+
+def _team(scenario: Scenario, n: int) -> tuple[Any, ...] | int:
+    """``n`` shepherds of the kind that the scenario has."""
+    bodies = scenario.shepherds
+    scenario.but(shepherds=n)  # refuses an impossible number
+    if any(body != bodies[0] for body in bodies):
+        raise SettingsError(f"shepherds: the scenario's bodies differ, so {n} of them says too little; give a body")
+    return bodies[:1] * n if bodies else n
+
+
+def _sortable(value: Any) -> tuple[int, Any]:
+    return (0, 0) if value is None else (1, value)

@@ -1,0 +1,77 @@
+"""Kernels between a scan and an observation: plain arrays in, plain arrays out."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@njit(cache=True, error_model="numpy")
+def proximities(ranges: Floats, n_channels: int, goal_row: int, reach: float, goal_reach: float) -> Any:
+    """Proximities 1 - d/range, (P, n_channels, beams) float32, of the first readings (>= n_channels, P, beams) [m]."""
+    n_shepherds, beams = ranges.shape[1], ranges.shape[2]
+    out = np.empty((n_shepherds, n_channels, beams), np.float32)
+    for c in range(n_channels):
+        full = goal_reach if c == goal_row else reach
+        for p in range(n_shepherds):
+            for k in range(beams):
+                near = 1.0 - ranges[c, p, k] / full
+                out[p, c, k] = near if near > 0.0 else 0.0
+    return out
+
+
+@njit(cache=True, error_model="numpy")
+def goal_offsets(goal: Any, last: Ints, directions: Floats) -> Ints:
+    """Beam nearest to the circular mean of the lit goal beams, (P,).
+
+    Args:
+        goal: (P, beams) proximities of the goal, 0 where it is not seen.
+        last: (P,) kept where nothing is lit, or more than half of the beams: from outside the goal at most
+            half of them can be.
+        directions: (2, 2 beams).
+    """
+    n, beams = goal.shape
+    offsets = last.copy()
+    for p in range(n):
+        cx, cy, lit = 0.0, 0.0, 0
+        for k in range(beams):
+            if goal[p, k] > 0.0:
+                lit += 1
+                cx += directions[0, k]
+                cy += directions[1, k]
+        if lit > 0 and 2 * lit <= beams and math.hypot(cx, cy) > 1e-9:
+            offsets[p] = int(np.rint(math.atan2(cy, cx) * beams / (2.0 * math.pi))) % beams
+    return offsets
+
+
+@njit(cache=True, error_model="numpy")
+def rolled_sectors(rows: Any, offsets: Ints, sectors: int) -> Any:
+    """Rows (P, R, beams) float32 rolled so that beam ``offsets[p]`` comes first; the greatest of each sector.
+
+    Returns:
+        (P, R, sectors) float32; sector j holds beams s j - s // 2 .. of the rolled row, s = beams / sectors.
+    """
+    n, n_rows, beams = rows.shape
+    size = beams // sectors
+    out = np.empty((n, n_rows, sectors), np.float32)
+    for p in range(n):
+        start = (offsets[p] - size // 2) % beams
+        for i in range(n_rows):
+            low = start
+            for j in range(sectors):
+                high = low + size
+                best = rows[p, i, low]
+                for k in range(low + 1, min(high, beams)):
+                    best = rows[p, i, k] if rows[p, i, k] > best else best
+                for k in range(high - beams):  # the sector that goes round the end
+                    best = rows[p, i, k] if rows[p, i, k] > best else best
+                out[p, i, j] = best
+                low = high if high < beams else high - beams
+    return out

@@ -1,0 +1,172 @@
+"""How sheep wish to move: flock models, from the state of the world to desired velocities."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from pydantic import Field
+
+from shepherd_phys.neighbours import GRID_FROM, surroundings
+from shepherd_phys.settings import Settings, settings
+from shepherd_phys.state import WorldState
+
+Floats = NDArray[np.float64]
+
+
+@runtime_checkable
+class FlockModel(Protocol):
+    """What the world needs of a flock model. A user adds one by writing a class with this method."""
+
+    def velocities(self, state: WorldState, rng: np.random.Generator) -> Floats:
+        """Desired velocities of all sheep, from one snapshot.
+
+        Args:
+            state: the world now.
+            rng: the flock's own stream of random numbers.
+
+        Returns:
+            (N, 2) [m/s]. The direction of a row becomes the sheep's heading; a row of zeros stands still and
+            keeps the heading.
+        """
+        ...
+
+
+@settings
+class Strombom(Settings):
+    """The sheep of Strömbom et al. 2014 (J. R. Soc. Interface 11:20140719), equations 4.1-4.3.
+
+    A sheep is threatened while any shepherd is within r_s. Otherwise it grazes: it stands still, and with probability
+    p makes one step in a uniformly random direction. A threatened sheep at A_i with heading H_i moves along
+
+        H' = h H_i + c C_i + rho_a R_a + rho_s R_s + e eps,    v* = speed H' / |H'|
+
+    where C_i points to the mean position of the n nearest others, R_a is the normalised sum of unit(A_i - A_j) over
+    sheep nearer than r_a, R_s that of unit(A_i - S_j) over shepherds within r_s, and eps a unit vector in a
+    uniformly random direction. A term of length 0 is 0; if H' is 0 the heading stays.
+
+    Weights, p: the 2014 values. The paper's many shepherds are summed as here by its successors.
+    """
+
+    inertia: float = Field(default=0.5, ge=0)
+    """h, weight of the last heading [1] (2014)."""
+    attraction: float = Field(default=1.05, ge=0)
+    """c, weight of C [1] (2014)."""
+    repulsion: float = Field(default=2.0, ge=0)
+    """rho_a, weight of R_a [1] (2014)."""
+    flight: float = Field(default=1.0, ge=0)
+    """rho_s, weight of R_s [1] (2014)."""
+    noise: float = Field(default=0.3, ge=0)
+    """e, weight of eps [1] (2014)."""
+    detection_radius: float = Field(default=10.0, ge=0)
+    """r_s [m], the influence radius I of the perception-based rewards paper (65 m in 2014, at another scale)."""
+    sheep_distance: float = Field(default=0.4, ge=0)
+    """r_a [m], inferred from packing the goal (2 m in 2014, at another scale)."""
+    n_neighbours: int = Field(default=40, ge=1)
+    """n [sheep], at any distance, clipped to N - 1; the perception-based rewards paper varies it from 10 to 85."""
+    graze_probability: float = Field(default=0.05, ge=0, le=1)
+    """p per control step [1] (2014)."""
+
+    def velocities(self, state: WorldState, rng: np.random.Generator) -> Floats:
+        """Desired velocities (N, 2) [m/s].
+
+        Draws ``rng.random((N, 2))`` whatever happens: column 0 is below p where a grazing sheep moves, column 1
+        is the angle over 2 pi of its step, or of eps.
+        """
+        draws = rng.random((state.n_sheep, 2))
+        return desired(
+            state.sheep_pos, state.sheep_heading, state.sheep_max_speed, state.shepherd_pos, draws,
+            self.inertia, self.attraction, self.repulsion, self.flight, self.noise,
+            self.detection_radius, self.sheep_distance, self.n_neighbours, self.graze_probability,
+            state.n_sheep >= GRID_FROM,
+        )  # fmt: skip
+
+
+FLOCKS: dict[str, type[Any]] = {"Strombom": Strombom}
+"""The library's flock models by name, for files and the command line."""
+
+
+@njit(cache=True)
+def _unit(x: float, y: float) -> tuple[float, float]:
+    length = math.sqrt(x * x + y * y)
+    return (x / length, y / length) if length > 0.0 else (0.0, 0.0)
+
+
+@njit(cache=True)
+def flight(sheep: Floats, shepherds: Floats, r_s: float) -> tuple[NDArray[np.bool_], Floats]:
+    """Who is threatened, and whither it flees.
+
+    Args:
+        sheep: (N, 2) A_i [m].
+        shepherds: (P, 2) S_j [m].
+        r_s: [m].
+
+    Returns:
+        (N,) whether a shepherd is within r_s, |A_i - S_j| <= r_s; (N, 2) sum over those of unit(A_i - S_j).
+    """
+    threatened = np.zeros(len(sheep), np.bool_)
+    away = np.zeros((len(sheep), 2))
+    for i in range(len(sheep)):
+        for j in range(len(shepherds)):
+            dx, dy = sheep[i, 0] - shepherds[j, 0], sheep[i, 1] - shepherds[j, 1]
+            if dx * dx + dy * dy <= r_s * r_s:
+                threatened[i] = True
+                ux, uy = _unit(dx, dy)
+                away[i, 0] += ux
+                away[i, 1] += uy
+    return threatened, away
+
+
+@njit(cache=True)
+def desired(
+    sheep: Floats, heading: Floats, speed: Floats, shepherds: Floats, draws: Floats,
+    h: float, c: float, rho_a: float, rho_s: float, e: float, r_s: float, r_a: float, n: int, p: float,
+    use_grid: bool,
+) -> Floats:  # fmt: skip
+    """The rule of `Strombom`, for the whole flock at once.
+
+    Args:
+        sheep: (N, 2) A_i [m].
+        heading: (N, 2) H_i, unit vectors.
+        speed: (N,) [m/s].
+        shepherds: (P, 2) S_j [m].
+        draws: (N, 2) uniform in [0, 1): whether to step while grazing, and the angle over 2 pi.
+        h: inertia.
+        c: attraction.
+        rho_a: repulsion.
+        rho_s: flight.
+        e: noise.
+        r_s: detection radius [m].
+        r_a: sheep distance [m].
+        n: neighbours.
+        p: probability of a step while grazing.
+        use_grid: find neighbours through a grid; the same neighbours, faster for large flocks.
+
+    Returns:
+        (N, 2) v* [m/s].
+    """
+    velocity = np.zeros((len(sheep), 2))
+    threatened, away = flight(sheep, shepherds, r_s)
+    if threatened.any():
+        towards, apart = surroundings(sheep, threatened, n, r_a, use_grid, np.empty((0, 0), np.int64))
+    else:
+        towards, apart = away, away
+    for i in range(len(sheep)):
+        angle = 2.0 * math.pi * draws[i, 1]
+        if not threatened[i]:
+            if draws[i, 0] < p:
+                velocity[i, 0], velocity[i, 1] = speed[i] * math.cos(angle), speed[i] * math.sin(angle)
+            continue
+        cx, cy = _unit(towards[i, 0], towards[i, 1])
+        ax, ay = _unit(apart[i, 0], apart[i, 1])
+        sx, sy = _unit(away[i, 0], away[i, 1])
+        x = h * heading[i, 0] + c * cx + rho_a * ax + rho_s * sx + e * math.cos(angle)
+        y = h * heading[i, 1] + c * cy + rho_a * ay + rho_s * sy + e * math.sin(angle)
+        if x == 0.0 and y == 0.0:
+            x, y = heading[i, 0], heading[i, 1]
+        ux, uy = _unit(x, y)
+        velocity[i, 0], velocity[i, 1] = speed[i] * ux, speed[i] * uy
+    return velocity

@@ -1,0 +1,438 @@
+"""``shepherd-phys evaluate`` from the outside: tables, JSON, continuing, shards, grids, and every mistake."""
+
+import csv
+import json
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import pytest
+import tomli_w
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shepherd_phys import __version__, campaign
+from shepherd_phys.campaign import Ledger
+from shepherd_phys.controllers.evaluation import COLUMNS, METRICS, trial_seed
+from shepherd_phys.controllers.summary import summary_columns
+from shepherd_phys.scripts import evaluate, main
+from shepherd_phys.scripts.evaluate import GRID_KEYS, LISTS, read_options, read_shard
+from shepherd_phys.scripts.points import points
+from shepherd_phys.settings import SettingsError
+
+TINY = {"n_sheep": 6, "n_flocks": 2, "shepherds": 2, "n_steps": 6}
+COMMAND = Path(sys.executable).with_name("shepherd-phys")
+
+MINE = """
+import numpy as np
+from shepherd_phys.bodies import Disc
+from shepherd_phys.flock import Strombom
+
+print("a module that prints")
+
+class Chase:
+    lidar = None
+    def reset(self, rng): pass
+    def act(self, observation, state):
+        print("a controller that prints")
+        away = state.sheep_pos.mean(axis=0) - state.shepherd_pos
+        return away / np.linalg.norm(away, axis=1, keepdims=True)
+
+class Bad(Chase):
+    def act(self, observation, state): return np.full((state.n_shepherds, 2), np.nan)
+
+class Half:
+    lidar = None
+    def reset(self, rng): pass
+
+class Odd(Chase):
+    def to_dict(self): return {"rng": object()}
+
+class Slim(Disc): pass
+class Shy(Strombom): pass
+class Stone:
+    max_speed = 1.0
+class Free:
+    def velocities(self, state, rng): return np.zeros((state.n_sheep, 2))
+class Needy(Disc):
+    def __init__(self, what): pass
+number = 3
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A working directory with a tiny scenario and a user's module."""
+    (tmp_path / "tiny.toml").write_text(tomli_w.dumps(TINY))
+    (tmp_path / "mine.py").write_text(MINE)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    yield tmp_path
+    sys.modules.pop("mine", None)
+
+
+def shell(words, timeout=300):
+    return subprocess.run([COMMAND, *words.split()], capture_output=True, text=True, timeout=timeout)
+
+
+@pytest.fixture
+def in_process(monkeypatch):
+    """No worker processes: each takes seconds to start."""
+    monkeypatch.setattr(evaluate.campaign, "run", partial(campaign.run, retries=0))
+    monkeypatch.setitem(evaluate.LEAST, "workers", 0)
+
+
+def run(*words, workers=0):
+    return main.main(["evaluate", "--scenario", "tiny.toml", "--trials", "2", "--workers", str(workers), *words])
+
+
+def mistakes(err):
+    """Lines on standard error but for the progress of a slow machine and for what the user's module prints."""
+    return [line for line in err.splitlines() if "episodes/s" not in line and not line.startswith("a module that")]
+
+
+def read(path):
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+# ---- what it writes -----------------------------------------------------------------------------------------------
+
+
+def test_the_command_in_a_shell(folder):
+    done = shell(
+        "evaluate --scenario tiny.toml --controllers idle strombom --flocks 1 2 --cohesion 3 5 --shepherds 1 2 "
+        "--trials 2 --workers 2"
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-3:] == ["results/episodes.csv", "results/summary.csv", "results/episode.png"]
+    assert "in at the end %" in done.stdout
+    rows = read("results/episodes.csv")
+    assert tuple(rows[0]) == COLUMNS
+    assert len(rows) == 2 * 2 * 2 * 2 * 2
+    seen = {tuple(row[name] for name in COLUMNS[:4]) for row in rows}
+    assert seen == {(c, k, n, m) for c in ("idle", "strombom") for k in "12" for n in "35" for m in "12"}
+    assert {row["seed"] for row in rows} == {str(trial_seed(20_000, i)) for i in (0, 1)}
+    assert {(row["scenario"], row["n_sheep"], row["steps"], row["version"]) for row in rows} == {
+        ("tiny.toml", "6", "6", __version__)
+    }
+    assert len({row["settings_hash"] for row in rows}) == 16
+    summary = read("results/summary.csv")
+    assert tuple(summary[0]) == summary_columns()
+    assert len(summary) == 16
+    assert Path("results/episode.png").read_bytes().startswith(b"\x89PNG")
+    assert mistakes(done.stderr) == []
+
+
+def test_json_is_all_that_there_is_on_standard_output(folder):
+    done = shell("evaluate --scenario tiny.toml --controllers mine:Chase idle --trials 2 --workers 1 --json --out o")
+    assert done.returncode == 0, done.stderr
+    rows = json.loads(done.stdout)
+    assert [row["controller"] for row in rows] == ["idle", "mine:Chase"]
+    for row in rows:
+        assert (row["n_flocks"], row["cohesion"], row["n_shepherds"], row["trials"]) == (2, 40, 2, 2)
+        for name in METRICS:
+            assert row[f"{name}_low"] <= row[f"{name}_mean"] <= row[f"{name}_high"]
+    assert "o/summary.csv" in done.stderr
+
+
+def test_tables_do_not_depend_on_workers_order_or_interruption(folder, in_process):
+    assert run("--controllers", "idle", "random", "--out", "a", workers=0) == 0
+    assert run("--controllers", "random", "idle", "--out", "b", workers=2) == 0
+    with Ledger("b", __version__) as ledger:  # as a run that was killed half-way leaves it
+        ledger._rows.execute("DELETE FROM episodes WHERE seed = ?", (trial_seed(20_000, 1),))
+    assert run("--controllers", "idle", "random", "--out", "b", workers=1) == 0
+    for name in ("episodes.csv", "summary.csv"):
+        assert Path("a", name).read_bytes() == Path("b", name).read_bytes()
+
+
+def test_a_finished_campaign_runs_nothing(folder, in_process, monkeypatch, capsys):
+    assert run("--controllers", "idle") == 0
+    first = {path.name: path.read_bytes() for path in Path("results").iterdir()}
+    monkeypatch.setattr("shepherd_phys.campaign.attempt", None)
+    monkeypatch.setattr("shepherd_phys.scripts.evaluate.draw_episode", None)
+    assert run("--controllers", "idle") == 0
+    assert {path.name: path.read_bytes() for path in Path("results").iterdir()} == first
+    assert mistakes(capsys.readouterr().err) == []
+
+
+def test_more_trials_keep_the_earlier_ones(folder, in_process):
+    assert run("--controllers", "idle") == 0
+    two = read("results/episodes.csv")
+    assert run("--controllers", "idle", "--trials", "4") == 0
+    four = read("results/episodes.csv")
+    assert [row for row in four if row in two] == two
+
+
+def test_an_edited_class_does_not_find_the_rows_of_the_old_one(folder):
+    hashes = []
+    for source in (MINE, MINE.replace("away /", "-away /")):
+        Path("mine.py").write_text(source)
+        sys.modules.pop("mine", None)
+        hashes.append(points(controllers=["mine:Chase"], scenario="tiny.toml")[0].settings_hash())
+    assert hashes[0] != hashes[1]
+
+
+def test_settings_hash_tells_everything_apart_but_the_scenarios_name(folder):
+    def hash_of(**changes):
+        return points(**{"controllers": ["idle"], "scenario": "tiny.toml", **changes})[0].settings_hash()
+
+    Path("same.toml").write_text(tomli_w.dumps(TINY))
+    assert hash_of() == hash_of(scenario="same.toml") == hash_of(flocks=[2])
+    changes = [{}, {"flocks": [1]}, {"cohesion": [3]}, {"shepherds": [1]}, {"sheep": 5}, {"controllers": ["random"]}]
+    changes += [{"body": "mine:Slim"}, {"flock": "mine:Shy"}]
+    assert len({hash_of(**change) for change in changes}) == len(changes)
+
+
+def test_a_users_own_body_and_flock(folder, in_process):
+    assert run("--controllers", "mine:Chase", "--body", "mine:Slim", "--flock", "mine:Shy", "--cohesion", "4") == 0
+    assert {(row["controller"], row["cohesion"]) for row in read("results/episodes.csv")} == {("mine:Chase", "4")}
+    assert run("--controllers", "idle", "--flock", "mine:Free") == 0
+    assert {row["cohesion"] for row in read("results/episodes.csv")} == {""}
+
+
+def test_shards_make_up_the_whole(folder, in_process):
+    words = ["--controllers", "idle", "random", "--trials", "3"]
+    assert run(*words, "--out", "whole") == 0
+    parts = []
+    for i in "1234":
+        assert run(*words, "--out", i, "--shard", f"{i}/4") == 0
+        parts += read(f"{i}/episodes.csv")
+    key = lambda row: (row["controller"], int(row["seed"]))  # noqa: E731
+    assert sorted(parts, key=key) == read("whole/episodes.csv")
+
+
+def test_a_shard_may_be_empty(folder, in_process, capsys):
+    assert run("--controllers", "idle", "--shard", "3/3", "--json") == 0
+    assert json.loads(capsys.readouterr().out) == []
+    assert read("results/episodes.csv") == []
+
+
+def test_failed_episodes_are_named_and_the_others_complete(folder, in_process, capsys):
+    assert run("--controllers", "idle", "mine:Bad") == 1
+    said = capsys.readouterr()
+    lines = mistakes(said.err)
+    assert len(lines) == 2
+    for line, seed in zip(lines, (trial_seed(20_000, 0), trial_seed(20_000, 1)), strict=True):
+        assert f"mine:Bad, n_flocks 2, cohesion 40, n_shepherds 2, n_sheep 6, scenario tiny.toml, seed {seed}: " in line
+        assert "ControllerError: controller Bad, step 0: the action holds a NaN" in line
+    assert {row["controller"] for row in read("results/episodes.csv")} == {"idle"}
+
+
+def test_without_pygame_there_is_no_picture(folder, in_process, monkeypatch, capsys):
+    monkeypatch.setattr(evaluate.importlib.util, "find_spec", lambda name: None)
+    assert run("--controllers", "idle") == 0
+    said = capsys.readouterr()
+    assert "pygame-ce is missing" in said.err
+    assert not Path("results/episode.png").exists()
+
+
+def test_ctrl_c_ends_cleanly_and_says_how_to_go_on(folder):
+    words = "evaluate --scenario tiny.toml --controllers random --workers 1 --trials 100000"
+    with subprocess.Popen(
+        [COMMAND, *words.split()], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as command:
+        for _ in range(1200):
+            if Path("results/ledger.sqlite-wal").exists() and Path("results/ledger.sqlite-wal").stat().st_size > 50_000:
+                break
+            time.sleep(0.05)
+        command.send_signal(signal.SIGINT)
+        out, err = command.communicate(timeout=60)
+    assert command.returncode == 130
+    assert out == ""
+    (said,) = mistakes(err)
+    assert said.startswith("shepherd-phys evaluate: stopped; what was finished is kept in results/ledger.sqlite:")
+    with Ledger("results", __version__) as ledger:
+        assert ledger._rows.execute("SELECT count(*) FROM episodes").fetchone()[0] > 0
+
+
+# ---- grids --------------------------------------------------------------------------------------------------------
+
+
+def test_a_grid_file_is_the_same_as_flags(folder):
+    grid = {"controllers": ["idle", "random"], "flocks": [1, 2], "cohesion": [3], "trials": 7, "sheep": 5, "seed": 9}
+    Path("grid.toml").write_text(tomli_w.dumps(grid))
+    from_grid = read_options(["--grid", "grid.toml", "--shepherds", "1"])
+    flags = "--controllers idle random --flocks 1 2 --cohesion 3 --trials 7 --sheep 5 --seed 9 --shepherds 1"
+    from_flags = read_options(flags.split())
+    assert {name: getattr(from_grid, name) for name in GRID_KEYS} == {n: getattr(from_flags, n) for n in GRID_KEYS}
+
+
+VALUES = {
+    "controllers": st.lists(st.sampled_from(["idle", "random", "strombom"]), min_size=1, max_size=4),
+    "flocks": st.lists(st.integers(1, 6), min_size=1, max_size=4),
+    "cohesion": st.lists(st.integers(1, 99), min_size=1, max_size=4),
+    "shepherds": st.lists(st.integers(1, 4), min_size=1, max_size=4),
+}
+
+
+@given(st.fixed_dictionaries({}, optional=VALUES))
+def test_points_are_the_full_cross_product_without_repeats(lists):
+    found = points(**{"controllers": ["idle"], **lists})
+    expected = 1
+    for values in lists.values():
+        expected *= len(set(values))
+    assert len(found) == expected
+    assert len({json.dumps(point.labels) for point in found}) == expected
+    for name, label in zip(LISTS, ("controller", "n_flocks", "cohesion", "n_shepherds"), strict=True):
+        if name in lists:
+            assert {point.labels[label] for point in found} == set(lists[name])
+
+
+def test_a_world_that_cannot_be_placed_is_one_error(folder, in_process, capsys):
+    wall = {"kind": "Wall", "start": [-90.0, 0.0], "end": [90.0, 0.0], "thickness": 180.0}
+    Path("tiny.toml").write_text(tomli_w.dumps({**TINY, "obstacles": [wall]}))
+    assert run("--controllers", "idle") == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert len(mistakes(said.err)) == 1
+
+
+# ---- mistakes -----------------------------------------------------------------------------------------------------
+
+MISTAKES = [
+    ("--controllers nobody", "controllers: 'nobody' is unknown; there are idle, random, strombom"),
+    ("--controllers", "--controllers: needs at least one value"),
+    ("--controllers mine:Half", "controller Half: lacks act; a controller has lidar"),
+    ("--controllers mine:Odd", "parameters must be plain data"),
+    ("--controllers mine:Nobody", "controllers: mine:Nobody: module 'mine' has no 'Nobody'"),
+    ("--controllers nowhere:X", "module 'nowhere' cannot be imported: ModuleNotFoundError"),
+    ("--controllers mine:number", "controller int: lacks lidar and reset and act"),
+    ("--flocks 0", "flocks: 0 is impossible; it must be at least 1"),
+    ("--flocks abc", "--flocks"),
+    ("--flocks", "--flocks: needs at least one value"),
+    ("--flocks 7", "n_flocks is 7, more than there are sheep (6)"),
+    ("--cohesion -1", "cohesion"),
+    ("--cohesion 3 --flock mine:Free", "cohesion: the flock model mine:Free has no n_neighbours to set (given: 3)"),
+    ("--shepherds -1", "shepherds"),
+    ("--shepherds 99999", "Scenario.shepherds"),
+    ("--sheep 0", "sheep: 0 is impossible; it must be at least 1"),
+    ("--trials 0", "trials: 0 is impossible; it must be at least 1"),
+    ("--trials many", "--trials"),
+    ("--trials", "--trials"),
+    ("--seed -5", "seed"),
+    ("--workers 0", "workers: 0 is impossible; it must be at least 1"),
+    ("--timeout 0", "timeout: 0.0 is impossible; it must be above 0 s"),
+    ("--timeout nan", "timeout: nan is impossible"),
+    ("--shard 0/3", "shard: '0/3' is impossible; it must be I/N"),
+    ("--shard 4/3", "shard: '4/3' is impossible; it must be I/N"),
+    ("--shard half", "shard: 'half' is impossible; it must be I/N"),
+    ("--scenario nowhere", "scenario: 'nowhere' is neither a .toml file nor one of paper"),
+    ("--scenario nowhere.toml", "nowhere.toml: cannot be read (No such file or directory)"),
+    ("--scenario bad.toml", "bad.toml: is not a TOML file"),
+    ("--scenario odd.toml", "Scenario.n_shep: there is no such field"),
+    ("--body nobody", "body: 'nobody' is unknown; there are Disc"),
+    ("--body mine:Stone", "body: mine:Stone: lacks build, follow"),
+    ("--body mine:Needy", "body: Needy: cannot be made without arguments"),
+    ("--body mine:number", "body: mine:number: needs a class (it is a int)"),
+    ("--flock nobody", "flock: 'nobody' is unknown; there are"),
+    ("--flock mine:Stone", "flock: mine:Stone: lacks velocities"),
+    ("--grid nowhere.toml", "nowhere.toml: cannot be read"),
+    ("--grid bad.toml", "bad.toml: is not a TOML file"),
+    ("--grid odd.toml", "odd.toml: n_shep is unknown; a grid sets controllers, flocks"),
+    ("--grid words.toml", "words.toml: flocks must be a list of whole numbers (given: ['two'])"),
+    ("--grid true.toml", "true.toml: trials must be whole number (given: True)"),
+    ("--grid none.toml", "none.toml: flocks must be a list of whole numbers (given: [])"),
+    ("--grid zero.toml", "flocks: 0 is impossible"),
+    ("--grid flocks.toml --flocks 1", "--flocks is given and flocks.toml sets flocks too: leave one of them out"),
+    ("--out tiny.toml", "tiny.toml: cannot be made or written"),
+    ("--out tiny.toml/deeper", "cannot be made or written"),
+    ("--out other", "other/ledger.sqlite: holds rows of shepherd_phys 0.0.0, this is"),
+    ("--out used", "used: is in use by another run; wait for it or choose another folder"),
+    ("--flcks 1", "Unrecognized options: --flcks"),
+    ("idle", "Unrecognized options: idle"),
+]
+
+
+@pytest.mark.parametrize(("words", "message"), MISTAKES, ids=[words for words, _ in MISTAKES])
+def test_mistakes_are_one_clear_line(folder, capsys, words, message):
+    Path("bad.toml").write_text("n_sheep = = 3")
+    Path("odd.toml").write_text("n_shep = 3")
+    Path("words.toml").write_text('flocks = ["two"]')
+    Path("true.toml").write_text("trials = true")
+    Path("none.toml").write_text("flocks = []")
+    Path("zero.toml").write_text("flocks = [1, 0]")
+    Path("flocks.toml").write_text("flocks = [1, 2]")
+    Ledger("other", "0.0.0").close()
+    before = sorted(Path().iterdir())
+    given_words = words.split()
+    if "--scenario" not in given_words:
+        given_words = ["--scenario", "tiny.toml", *given_words]
+    with Ledger("used", __version__):
+        assert main.main(["evaluate", *given_words]) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    told = mistakes(said.err)
+    assert len(told) == 1
+    assert told[0].startswith("shepherd-phys evaluate: ")
+    assert message in told[0]
+    assert not Path("results").exists()
+    assert sorted(path for path in Path().iterdir() if path.name not in ("__pycache__", "used")) == before
+
+
+def test_a_mistake_in_a_shell(folder):
+    done = shell("evaluate --controllers nobody")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.count("\n") == 1
+    assert "Traceback" not in done.stderr
+
+
+def test_a_full_disk(folder, in_process, capsys, monkeypatch):
+    def full(fd):
+        raise OSError(28, "No space left on device")
+
+    assert run("--controllers", "idle") == 0
+    capsys.readouterr()
+    monkeypatch.setattr("shepherd_phys.campaign.os.fsync", full)
+    assert run("--controllers", "idle") == 1
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert "shepherd-phys evaluate: results/episodes.csv: cannot be written (No space left on device)" in said.err
+    assert len(read("results/episodes.csv")) == 2
+
+
+@given(st.text(alphabet="0123456789/-+ ²", max_size=6))
+def test_a_shard_is_read_or_refused(text):
+    try:
+        number, count = read_shard(text)
+    except SettingsError:
+        return
+    assert 1 <= number <= count
+
+
+# ---- the front door -----------------------------------------------------------------------------------------------
+
+
+def test_help_lists_every_flag(capsys):
+    with pytest.raises(SystemExit) as end:
+        main.main(["evaluate", "--help"])
+    assert end.value.code == 0
+    said = capsys.readouterr().out
+    for flag in (*GRID_KEYS, "grid", "shard", "workers", "timeout", "out", "json"):
+        assert f"--{flag}" in said
+
+
+def test_front_door(capsys):
+    assert main.main(["--help"]) == 0
+    assert "evaluate" in capsys.readouterr().out
+    assert main.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"shepherd-phys {__version__}\n"
+    for argv, problem in (([], "no command"), (["dance"], "unknown command 'dance'")):
+        assert main.main(argv) == 2
+        said = capsys.readouterr()
+        assert said.out == ""
+        assert said.err.startswith(f"shepherd-phys: {problem}; commands are evaluate, benchmark")
+
+
+def test_commands_exist():
+    scripts = Path(main.__file__).parent
+    assert [name for name in main.COMMANDS if not (scripts / f"{name}.py").exists()] == []
+
+
+def test_a_closed_pipe_is_no_error():
+    words = f"'{COMMAND}' --help | true"
+    done = subprocess.run(["sh", "-c", words], capture_output=True, text=True, timeout=300)
+    assert "Traceback" not in done.stderr
