@@ -86,7 +86,8 @@ class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     Scalars under the same keys at every step: ``in_goal`` and ``ever_in_goal`` (fractions of the sheep),
     ``path_length`` (mean over the shepherds [m]), ``collisions`` (new contacts since reset), ``is_success`` (95 % in
-    now), ``reward/<name>`` (weighted; they add up to the reward), ``share/<name>/<k>`` (shepherd k's own share of a term that has shares).
+    now), ``reward/<name>`` (weighted; they add up to the reward), ``share/<name>/<k>`` (shepherd k's own share of a
+    term that has shares).
 
     ## Arguments
 

@@ -17,13 +17,14 @@ from typing import Annotated, Any
 
 import numpy as np
 import tyro
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from shepherd_phys import __version__, campaign
 from shepherd_phys.campaign import CampaignError, Ledger
-from shepherd_phys.controllers.evaluation import ControllerError, run_episode, trial_seed
+from shepherd_phys.controllers.evaluation import LABELS, ControllerError, run_episode, trial_seed
 from shepherd_phys.envs.shepherding import ShepherdingEnv
 from shepherd_phys.scenario import SCENARIOS
 from shepherd_phys.settings import SettingsError, read_toml
@@ -44,8 +45,10 @@ def cpu_count() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _metavar(name: str) -> Any:
-    return tyro.conf.arg(metavar=name)
+def _flag(metavar: str, default: str | None = None) -> Any:
+    """How ``--help`` shows a flag; ``default`` in words where the value does not tell."""
+    hint = f"(default: {default})" if default else default
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint=hint)
 
 
 @dataclass(frozen=True)
@@ -56,35 +59,35 @@ class Evaluate:
     folder --out, with a ledger that lets a stopped campaign continue: give the same command again.
     """
 
-    controllers: Annotated[tuple[str, ...], _metavar("NAME ..")] = ("strombom",)
+    controllers: Annotated[tuple[str, ...], _flag("NAME ..")] = ("strombom",)
     """Controllers by name, or module:Name of your own (imported from the current directory)."""
-    flocks: Annotated[tuple[int, ...], _metavar("K ..")] = ()
-    """Numbers of flocks (default: the scenario's)."""
-    cohesion: Annotated[tuple[int, ...], _metavar("N ..")] = ()
-    """Numbers of neighbours that attract a sheep (default: the scenario's)."""
-    shepherds: Annotated[tuple[int, ...], _metavar("M ..")] = ()
-    """Numbers of shepherds (default: the scenario's)."""
-    sheep: Annotated[int | None, _metavar("N")] = None
-    """Number of sheep (default: the scenario's)."""
-    scenario: Annotated[str, _metavar("NAME|FILE")] = "paper"
+    flocks: Annotated[tuple[int, ...], _flag("K ..", "the scenario's")] = ()
+    """Numbers of flocks."""
+    cohesion: Annotated[tuple[int, ...], _flag("N ..", "the scenario's")] = ()
+    """Numbers of neighbours that attract a sheep."""
+    shepherds: Annotated[tuple[int, ...], _flag("M ..", "the scenario's")] = ()
+    """Numbers of shepherds."""
+    sheep: Annotated[int | None, _flag("N", "the scenario's")] = None
+    """Number of sheep."""
+    scenario: Annotated[str, _flag("NAME|FILE")] = "paper"
     """A preset's name or a TOML file."""
-    body: Annotated[str | None, _metavar("NAME|module:Name")] = None
-    """Body of every shepherd (default: the scenario's)."""
-    flock: Annotated[str | None, _metavar("NAME|module:Name")] = None
-    """Flock model (default: the scenario's)."""
-    trials: Annotated[int, _metavar("T")] = 100
+    body: Annotated[str | None, _flag("NAME|module:Name", "the scenario's")] = None
+    """Body of every shepherd."""
+    flock: Annotated[str | None, _flag("NAME|module:Name", "the scenario's")] = None
+    """Flock model."""
+    trials: Annotated[int, _flag("T")] = 100
     """Episodes a point."""
-    seed: Annotated[int, _metavar("S")] = 20_000
+    seed: Annotated[int, _flag("S")] = 20_000
     """Root seed: trial i has a seed derived from S and i alone, the same for every controller and point."""
-    grid: Annotated[Path | None, _metavar("FILE")] = None
+    grid: Annotated[Path | None, _flag("FILE", "")] = None
     """A TOML file with any of the options above, e.g. flocks = [1, 2]."""
-    shard: Annotated[str | None, _metavar("I/N")] = None
+    shard: Annotated[str | None, _flag("I/N", "")] = None
     """Run only the I-th of N equal parts (1-based), for machines that share nothing."""
-    workers: Annotated[int, _metavar("W")] = cpu_count()
+    workers: Annotated[int, _flag("W")] = cpu_count()
     """Worker processes; the results do not depend on it."""
-    timeout: Annotated[float, _metavar("SECONDS")] = 600.0
+    timeout: Annotated[float, _flag("SECONDS")] = 600.0
     """An episode that takes longer counts as hung."""
-    out: Annotated[Path, _metavar("DIR")] = Path("results")
+    out: Annotated[Path, _flag("DIR")] = Path("results")
     """Folder for tables and ledger; an unfinished campaign in it is continued."""
     json: tyro.conf.FlagCreatePairsOff[bool] = False
     """Print the summary as one JSON array, and nothing else, on standard output."""
@@ -92,6 +95,8 @@ class Evaluate:
 
 GRID_KEYS = ("controllers", "flocks", "cohesion", "shepherds", "sheep", "scenario", "body", "flock", "trials", "seed")
 LISTS = {"controllers": str, "flocks": int, "cohesion": int, "shepherds": int}
+WANTED = dict.fromkeys(("flocks", "cohesion", "shepherds"), "whole numbers")
+WANTED |= dict.fromkeys(("sheep", "trials", "seed", "workers"), "a whole number") | {"timeout": "a number of seconds"}
 LEAST = {"flocks": 1, "cohesion": 1, "shepherds": 1, "sheep": 1, "trials": 1, "seed": 0, "workers": 1}
 
 
@@ -177,7 +182,9 @@ def read_options(argv: Sequence[str]) -> Evaluate:
     except SystemExit as end:
         if not end.code:
             raise
-        raise SettingsError(_one_line(said.getvalue())) from None
+        problem = _one_line(said.getvalue())
+        wanted = [f"; --{name} takes {what}" for name, what in WANTED.items() if f"--{name}" in problem]
+        raise SettingsError(f"{problem}{''.join(wanted[:1])} (see {PROG} --help)") from None
     flags = {f.name for f in fields(Evaluate) if any(a == f"--{f.name}" or a.startswith(f"--{f.name}=") for a in argv)}
     values = {f.name: getattr(options, f.name) for f in fields(Evaluate)}
     for name in LISTS:
@@ -233,40 +240,53 @@ def read_shard(text: str | None) -> tuple[int, int]:
 
 
 def _one_line(box: str) -> str:
-    """What a box of tyro's says, without the box and without the help below its first rule."""
-    words = []
+    """What a box of tyro's says, without its title, frame and the help below the message's rule.
+
+    Where standard output is not UTF-8, the frame is of blanks and hyphens, and the title has a rule of its own.
+    """
+    framed = "╭" in box
+    parts: list[list[str]] = [[]]
     for line in box.splitlines():
         line = line.strip("│ ")
-        if line.startswith("───"):
-            break
-        if not line.startswith(("╭", "╰")):
-            words.append(line)
-    return " ".join(" ".join(words).split()) + f" (see {PROG} --help)"
+        if line and not line.strip("─-"):
+            parts.append([])
+        elif not line.startswith(("╭", "╰")):
+            parts[-1].append(line)
+    message = parts[0] if framed or len(parts) == 1 else parts[1]
+    return " ".join(" ".join(message).split())
 
 
 def print_table(summary: Sequence[Mapping[str, Any]]) -> None:
-    """Print what matters most of the summary on standard output."""
-    shown = {
+    """Print what matters most of the summary on standard output; what is the same in all rows stands above it."""
+    metrics = {
         "in_goal_end": ("in at the end %", ".1f"),
-        "ever_in_goal": ("ever in %", ".1f"),
         "path_length": ("path m", ".0f"),
-        "time_to_95": ("time to 95 % s", ".0f"),
-        "collisions": ("collisions", ".1f"),
+        "time_to_95": ("95 % in after s", ".0f"),
     }
-    grid = Table(title="mean [95 % bootstrap interval]", title_justify="left")
-    for name in ("controller", "scenario", "sheep", "flocks", "cohesion", "shepherds", "trials"):
-        grid.add_column(name, justify="left" if name in ("controller", "scenario") else "right", no_wrap=True)
-    for title, _ in shown.values():
+    labels = [name for name in (*LABELS, "trials") if name == "controller" or len({row[name] for row in summary}) > 1]
+    same = [f"{name} {summary[0][name]}" for name in (*LABELS, "trials") if summary and name not in labels]
+    grid = Table(
+        title="\n".join([", ".join(same), "mean [95 % bootstrap interval]"]),
+        title_justify="left",
+        box=SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+        pad_edge=False,
+    )
+    for name in labels:
+        grid.add_column(name.removeprefix("n_"), justify="left" if name in ("controller", "scenario") else "right")
+    for title, _ in metrics.values():
         grid.add_column(title, justify="right", no_wrap=True)
     for row in summary:
-        labels = ("controller", "scenario", "n_sheep", "n_flocks", "cohesion", "n_shepherds", "trials")
         grid.add_row(
             *("" if row[name] is None else str(row[name]) for name in labels),
-            *(f"{row[f'{n}_mean']:{f}} [{row[f'{n}_low']:{f}}, {row[f'{n}_high']:{f}}]" for n, (_, f) in shown.items()),
+            *(
+                f"{row[f'{n}_mean']:{f}} [{row[f'{n}_low']:{f}}, {row[f'{n}_high']:{f}}]"
+                for n, (_, f) in metrics.items()
+            ),
         )
     console = Console(file=sys.stdout, markup=False, highlight=False)
     if not console.is_terminal:
-        console.width = 220  # a file has no edge to wrap at
+        console.width = 200  # a file has no edge to wrap at
     console.print(grid)
 
 
@@ -282,22 +302,27 @@ def progress_bar() -> Iterator[Any]:
         console=console,
         disable=not console.is_terminal,
     )
-    shown = bar.add_task("episodes", total=None, pace="")
-    began, last, before = time.monotonic(), time.monotonic(), None
+    shown = bar.add_task("episodes", total=None, pace="starting")
+    logged = time.monotonic()
+    first: tuple[float, int] | None = None
+    before: int | None = None
 
     def report(now: campaign.Progress) -> None:
-        nonlocal last, before
-        before = now.done if before is None else before
-        seconds = time.monotonic() - began
-        rate = (now.done - before) / seconds if seconds else 0.0
-        left = (now.total - now.done - now.failed) / rate if rate else None
-        pace = f"{rate:.2f} episodes/s, {'?' if left is None else _clock(left)} left"
+        nonlocal logged, first, before
+        ended = now.done + now.failed
+        before = ended if before is None else before
+        if first is None and ended > before:
+            first = time.monotonic(), ended  # the pace is counted from here: until here workers were starting
+        pace = "starting"
+        if first is not None and ended > first[1]:
+            rate = (ended - first[1]) / (time.monotonic() - first[0])
+            pace = f"{rate:.2f} episodes/s, {_clock((now.total - ended) / rate)} left"
         if now.failed:
             pace += f", {now.failed} failed"
-        bar.update(shown, total=now.total, completed=now.done + now.failed, pace=pace)
-        if not console.is_terminal and time.monotonic() - last > LOG_SECONDS:
-            last = time.monotonic()
-            print(f"{now.done + now.failed}/{now.total} episodes, {pace}", file=sys.stderr, flush=True)
+        bar.update(shown, total=now.total, completed=ended, pace=pace)
+        if not console.is_terminal and time.monotonic() - logged > LOG_SECONDS:
+            logged = time.monotonic()
+            print(f"{ended}/{now.total} episodes: {pace}", file=sys.stderr, flush=True)
 
     with bar:
         yield report

@@ -95,7 +95,7 @@ class PlainWorld:
         speed = np.array([body.max_speed for body in scenario.shepherds])[:, None]
         wanted = np.concatenate([wanted_sheep, action / size * speed])
         h = scenario.physics_dt
-        for _ in range(scenario.substeps):
+        for _ in range(scenario.n_substeps):
             for body, target in zip(self.sheep + self.shepherds, wanted, strict=True):
                 acceleration = (target - np.array(tuple(body.velocity))) / h
                 length = np.hypot(acceleration[0], acceleration[1])

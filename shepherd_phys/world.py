@@ -125,7 +125,7 @@ class World:
                 break
         else:
             raise PlacementError(
-                f"obstacles: in {PLACE_TRIES} draws they left no room for the goal, a shepherd or the middle of a flock; "
+                f"obstacles: in {PLACE_TRIES} draws they left no room for the goal, a shepherd or a flock's middle; "
                 "fewer or smaller ones, a larger box or another goal_pos make some"
             )
         pos = relax(
@@ -257,6 +257,7 @@ class World:
         # the static body, once touched, is the last row of every batch
         n_rows = n + p + (1 if static else 0)
         self._command = np.zeros((n + p, 3))
+        self._poses = np.zeros((n + p, 3))
         self._force = np.zeros((n_rows, 3 if self._spins else 2))
         if self._state is None:
             # pymunk never frees batch buffers: made once and used by every Space of this world; not before the first
@@ -301,7 +302,7 @@ class World:
 
         h = scenario.physics_dt
         rows = self._rows
-        for substep in range(scenario.substeps):
+        for substep in range(scenario.n_substeps):
             if self._followers:
                 command = self._follow(rows, h)
             _servo(
@@ -317,7 +318,7 @@ class World:
             )
             batch.set_space_bodies(space, self._force_fields, self._write_buffer)
             space.step(h)
-            if substep + 1 < scenario.substeps:
+            if substep + 1 < scenario.n_substeps:
                 rows = self._read()
 
         self._state = self._measure(
@@ -366,7 +367,7 @@ class World:
         at, at_vel, angle, walked = np.empty((p, 2)), np.empty((p, 2)), np.empty(p), np.empty(p)
         if not _measure(
             rows, self._command, heading, arrived, previous, path, self._goal, scenario.goal_radius,
-            pos, vel, turned, distance, inside, ever, at, at_vel, angle, walked,
+            pos, vel, turned, distance, inside, ever, at, at_vel, angle, walked, self._poses,
         ):  # fmt: skip
             raise NonFiniteError("the engine gave positions or velocities that are not finite")
         for array in (pos, vel, turned, distance, inside, ever, at, at_vel, angle, walked):
@@ -414,8 +415,7 @@ class World:
             sensor = Sensor(lidar, compile_shapes(self._shapes), self.space, sheep_shapes, self._n, self._p)
             self._sensors[lidar] = sensor
         masks: Mapping[str, NDArray[np.bool_]] = {name: SHEEP_SETS[name](state) for name in sets}
-        poses = _poses(self._rows, self._n + self._p, self._spins)
-        return sensor.scan(poses, state.goal_pos, state.goal_radius, masks)
+        return sensor.scan(self._poses, state.goal_pos, state.goal_radius, masks)
 
 
 def _out_of(solids: Geometry, pos: Floats, radius: Floats) -> Floats:
@@ -471,7 +471,7 @@ def _servo(rows, command, mass, moment, h, limit, spin_limit, spins, force):  # 
 @numba.njit(cache=True)
 def _measure(  # type: ignore[no-untyped-def]
     rows, command, heading, arrived, previous, path, goal, goal_radius,
-    pos, vel, turned, distance, inside, ever, at, at_vel, angle, walked,
+    pos, vel, turned, distance, inside, ever, at, at_vel, angle, walked, poses,
 ):  # fmt: skip
     """Write positions, velocities, headings, distances to the goal, who is in it, what shepherds walked; all finite?"""
     n, p = len(pos), len(at)
@@ -481,6 +481,7 @@ def _measure(  # type: ignore[no-untyped-def]
     for i in range(n):
         x, y = rows[i, 0], rows[i, 1]
         pos[i, 0], pos[i, 1] = x, y
+        poses[i, 0], poses[i, 1], poses[i, 2] = x, y, rows[i, 2] if spins else 0.0
         vel[i, 0], vel[i, 1] = rows[i, v], rows[i, v + 1]
         total += x + y + vel[i, 0] + vel[i, 1]
         # a sheep that stands still keeps the direction that it was last commanded
@@ -497,17 +498,7 @@ def _measure(  # type: ignore[no-untyped-def]
         at[k, 0], at[k, 1] = x, y
         at_vel[k, 0], at_vel[k, 1] = rows[n + k, v], rows[n + k, v + 1]
         angle[k] = rows[n + k, 2] if spins else 0.0
+        poses[n + k, 0], poses[n + k, 1], poses[n + k, 2] = x, y, angle[k]
         total += x + y + at_vel[k, 0] + at_vel[k, 1] + angle[k]
         walked[k] = path[k] + math.sqrt((x - previous[k, 0]) ** 2 + (y - previous[k, 1]) ** 2)
     return math.isfinite(total)
-
-
-@numba.njit(cache=True)
-def _poses(rows, k, spins):  # type: ignore[no-untyped-def]
-    """(K, 3) x, y, angle of all bodies that move."""
-    poses = np.zeros((k, 3))
-    for i in range(k):
-        poses[i, 0], poses[i, 1] = rows[i, 0], rows[i, 1]
-        if spins:
-            poses[i, 2] = rows[i, 2]
-    return poses

@@ -1,6 +1,7 @@
 """``shepherd-phys evaluate`` from the outside: tables, JSON, continuing, shards, grids, and every mistake."""
 
 import csv
+import io
 import json
 import signal
 import subprocess
@@ -91,7 +92,7 @@ def run(*words, workers=0):
 
 def mistakes(err):
     """Lines on standard error but for the progress of a slow machine and for what the user's module prints."""
-    return [line for line in err.splitlines() if "episodes/s" not in line and not line.startswith("a module that")]
+    return [line for line in err.splitlines() if " episodes: " not in line and not line.startswith("a module that")]
 
 
 def read(path):
@@ -302,7 +303,7 @@ MISTAKES = [
     ("--controllers nowhere:X", "module 'nowhere' cannot be imported: ModuleNotFoundError"),
     ("--controllers mine:number", "controller int: lacks lidar and reset and act"),
     ("--flocks 0", "flocks: 0 is impossible; it must be at least 1"),
-    ("--flocks abc", "--flocks"),
+    ("--flocks abc", "['abc']; --flocks takes whole numbers"),
     ("--flocks", "--flocks: needs at least one value"),
     ("--flocks 7", "n_flocks is 7, more than there are sheep (6)"),
     ("--cohesion -1", "cohesion"),
@@ -311,7 +312,7 @@ MISTAKES = [
     ("--shepherds 99999", "Scenario.shepherds"),
     ("--sheep 0", "sheep: 0 is impossible; it must be at least 1"),
     ("--trials 0", "trials: 0 is impossible; it must be at least 1"),
-    ("--trials many", "--trials"),
+    ("--trials many", "; --trials takes a whole number"),
     ("--trials", "--trials"),
     ("--seed -5", "seed"),
     ("--workers 0", "workers: 0 is impossible; it must be at least 1"),
@@ -392,6 +393,17 @@ def test_a_full_disk(folder, in_process, capsys, monkeypatch):
     assert said.out == ""
     assert "shepherd-phys evaluate: results/episodes.csv: cannot be written (No space left on device)" in said.err
     assert len(read("results/episodes.csv")) == 2
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "ascii"])
+def test_mistakes_are_one_line_on_any_terminal(monkeypatch, encoding):
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(io.BytesIO(), encoding=encoding))
+    with pytest.raises(SettingsError) as problem:
+        read_options(["--flocks", "abc"])
+    assert str(problem.value) == (
+        "Error parsing --flocks: Could not find valid parse for arguments: ['abc']; "
+        "--flocks takes whole numbers (see shepherd-phys evaluate --help)"
+    )
 
 
 @given(st.text(alphabet="0123456789/-+ ²", max_size=6))
