@@ -14,6 +14,7 @@ the whole team. N sheep, T steps of an episode, P shepherds.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cached_property
 from typing import Literal, Protocol
 
 import numba
@@ -66,7 +67,7 @@ class Distance(Settings):
     def __call__(self, before: WorldState, after: WorldState, scan: Scan | None, scenario: Scenario) -> float:
         """Not negative."""
         outside = after.n_sheep - np.count_nonzero(after.sheep_in_goal)
-        total = float(outside + after.sheep_goal_distance.sum())  # d_i is 0 inside
+        total = float(outside + np.add.reduce(after.sheep_goal_distance))  # d_i is 0 inside
         if self.norm == "none":
             return total
         return total / (scenario.n_steps * (after.n_sheep if self.norm == "NT" else 1))
@@ -89,7 +90,7 @@ class Occlusion(Settings):
     influence: float = Field(default=10.0, gt=0)
     """I, the shepherds' radius of influence [m]."""
 
-    @property
+    @cached_property
     def scans(self) -> tuple[str, ...]:
         """The scan of S, and the goal's."""
         if self.sheep == "any":
@@ -100,8 +101,8 @@ class Occlusion(Settings):
         """(P,) each shepherd's beams that count, over T."""
         if scan is None:
             raise ValueError("the occlusion term needs a scan")
-        sheep, goal = scan[self.scans[0]], scan["goal"]
-        counted: Floats = _occluding(sheep, goal, self.alpha, self.influence) / scenario.n_steps
+        seen, goal = self.scans
+        counted: Floats = _occluding(scan[seen], scan[goal], self.alpha, self.influence) / scenario.n_steps
         return counted
 
     def __call__(self, before: WorldState, after: WorldState, scan: Scan | None, scenario: Scenario) -> float:

@@ -15,7 +15,7 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class WorldState:
     """What the world is at the end of a control step.
 
@@ -75,6 +75,17 @@ class WorldState:
         """P."""
         return len(self.shepherd_pos)
 
+    @classmethod
+    def of(cls, values: dict[str, Any]) -> WorldState:
+        """The state of all fields by name, which is kept and not copied.
+
+        A frozen dataclass assigns field by field, which costs more than everything else in a state; the world makes
+        one each step and takes this way instead.
+        """
+        state = object.__new__(cls)
+        object.__setattr__(state, "__dict__", values)
+        return state
+
     def but(self, **changes: Any) -> WorldState:
         """A copy with some fields changed; arrays are copied and made read-only."""
         values = {f.name: getattr(self, f.name) for f in fields(self)}
@@ -89,7 +100,7 @@ class WorldState:
 
 def frozen(array: NDArray[Any]) -> NDArray[Any]:
     """The same array, read-only from now on."""
-    array.flags.writeable = False
+    array.setflags(write=False)
     return array
 
 

@@ -80,6 +80,7 @@ class World:
         if not hasattr(scenario.flock, "velocities"):
             raise SettingsError(f"flock ({kind_of(scenario.flock)}): a flock model needs 'velocities'")
         self.scenario = scenario
+        self._h, self._substeps = scenario.physics_dt, scenario.n_substeps
         self._n = scenario.n_sheep
         self._p = scenario.n_shepherds
         self._state: WorldState | None = None
@@ -241,10 +242,19 @@ class World:
 
         n, p = self._n, self._p
         radius = np.array([reach for _, _, reach in bodies])
-        self._radius = frozen(radius[:n].copy()), frozen(radius[n:].copy())
         self._speed = frozen(np.array([float(body.max_speed) for body in scenario.shepherds]))
         self._sheep_speed = frozen(np.full(n, float(scenario.sheep.max_speed)))
         self._goal = frozen(np.array(goal, dtype=np.float64))
+        self._constant = {
+            "goal_pos": self._goal,
+            "goal_radius": scenario.goal_radius,
+            "sheep_radius": frozen(radius[:n].copy()),
+            "sheep_max_speed": self._sheep_speed,
+            "shepherd_radius": frozen(radius[n:].copy()),
+            "shepherd_max_speed": self._speed,
+            "obstacles": scenario.obstacles,
+            "control_dt": scenario.control_dt,
+        }
         self._mass = np.array([body.mass for body, _, _ in bodies])
         self._moment = np.array([body.moment for body, _, _ in bodies])
         # a body of infinite moment cannot spin: where that holds for all, angles are neither read nor written
@@ -253,6 +263,7 @@ class World:
         if type(scenario.sheep) is not Disc:
             self._followers = [(i, scenario.sheep) for i in range(n)] + self._followers
         self._sensors: dict[Lidar, Sensor] = {}
+        self._sensor: Sensor | None = None
 
         # the static body, once touched, is the last row of every batch
         n_rows = n + p + (1 if static else 0)
@@ -267,7 +278,11 @@ class World:
         self._fields = _POSES if self._spins else _LINEAR
         self._force_fields = batch.BodyFields.FORCE | batch.BodyFields.TORQUE if self._spins else batch.BodyFields.FORCE
 
-        rows = self._read()
+        # the first read makes pymunk's memory as large as it needs to be; from then on it stays where it is
+        self._read_buffer.clear()
+        batch.get_space_bodies(space, self._fields, self._read_buffer)
+        self._rows: Floats = np.frombuffer(self._read_buffer.float_buf()).reshape(n_rows, 6 if self._spins else 4)
+        rows = self._rows
         self._state = self._measure(rows, 0, heading, arrived, rows[n : n + p, :2], np.zeros(p))
         return self._state
 
@@ -300,9 +315,9 @@ class World:
             who = "action" if bad == 1 else f"velocities of the flock model ({type(scenario.flock).__name__})"
             raise NonFiniteError(f"{who}: every number must be finite")
 
-        h = scenario.physics_dt
+        h, substeps = self._h, self._substeps
         rows = self._rows
-        for substep in range(scenario.n_substeps):
+        for substep in range(substeps):
             if self._followers:
                 command = self._follow(rows, h)
             _servo(
@@ -318,7 +333,7 @@ class World:
             )
             batch.set_space_bodies(space, self._force_fields, self._write_buffer)
             space.step(h)
-            if substep + 1 < scenario.n_substeps:
+            if substep + 1 < substeps:
                 rows = self._read()
 
         self._state = self._measure(
@@ -346,14 +361,9 @@ class World:
         return followed
 
     def _read(self) -> Floats:
-        """One batch read: (rows, 4) x, y, vx, vy or (rows, 6) x, y, angle, vx, vy, spin."""
-        buffer = self._read_buffer
-        buffer.clear()
-        batch.get_space_bodies(self.space, self._fields, buffer)
-        flat = np.frombuffer(buffer.float_buf())
-        if flat.size != len(self._force) * (6 if self._spins else 4):
-            raise RuntimeError("pymunk's batch API gave another number of values than asked for")
-        self._rows: Floats = flat.reshape(len(self._force), -1)
+        """One batch read: (rows, 4) x, y, vx, vy or (rows, 6) x, y, angle, vx, vy, spin; the next one overwrites it."""
+        self._read_buffer.clear()
+        batch.get_space_bodies(self.space, self._fields, self._read_buffer)
         return self._rows
 
     def _measure(
@@ -371,29 +381,24 @@ class World:
         ):  # fmt: skip
             raise NonFiniteError("the engine gave positions or velocities that are not finite")
         for array in (pos, vel, turned, distance, inside, ever, at, at_vel, angle, walked):
-            array.flags.writeable = False
-        return WorldState(
-            step,
-            step * scenario.control_dt,
-            self._goal,
-            scenario.goal_radius,
-            pos,
-            vel,
-            turned,
-            distance,
-            inside,
-            ever,
-            self._radius[0],
-            self._sheep_speed,
-            at,
-            at_vel,
-            angle,
-            self._radius[1],
-            self._speed,
-            walked,
-            self._collisions,
-            scenario.obstacles,
-            scenario.control_dt,
+            array.setflags(write=False)
+        return WorldState.of(
+            {
+                **self._constant,
+                "step": step,
+                "time": step * scenario.control_dt,
+                "sheep_pos": pos,
+                "sheep_vel": vel,
+                "sheep_heading": turned,
+                "sheep_goal_distance": distance,
+                "sheep_in_goal": inside,
+                "sheep_arrived": ever,
+                "shepherd_pos": at,
+                "shepherd_vel": at_vel,
+                "shepherd_angle": angle,
+                "shepherd_path": walked,
+                "collisions": self._collisions,
+            }
         )
 
     # ------------------------------------------------------------------- scan
@@ -406,14 +411,17 @@ class World:
             sets: names of `SHEEP_SETS` to scan on their own besides.
         """
         state = self.state
-        sensor = self._sensors.get(lidar)
-        if sensor is None:
-            sheep_shapes: list[list[pymunk.Shape]] = [[] for _ in range(self._n)]
-            for shape, row, channel in self._shapes:
-                if channel == SHEEP:
-                    sheep_shapes[row].append(shape)
-            sensor = Sensor(lidar, compile_shapes(self._shapes), self.space, sheep_shapes, self._n, self._p)
-            self._sensors[lidar] = sensor
+        sensor = self._sensor
+        if sensor is None or sensor.lidar is not lidar:  # the usual one is found without hashing its settings
+            sensor = self._sensors.get(lidar)
+            if sensor is None:
+                sheep_shapes: list[list[pymunk.Shape]] = [[] for _ in range(self._n)]
+                for shape, row, channel in self._shapes:
+                    if channel == SHEEP:
+                        sheep_shapes[row].append(shape)
+                sensor = Sensor(lidar, compile_shapes(self._shapes), self.space, sheep_shapes, self._n, self._p)
+                self._sensors[lidar] = sensor
+            self._sensor = sensor
         masks: Mapping[str, NDArray[np.bool_]] = {name: SHEEP_SETS[name](state) for name in sets}
         return sensor.scan(self._poses, state.goal_pos, state.goal_radius, masks)
 

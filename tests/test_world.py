@@ -82,6 +82,19 @@ def test_batch_read_gives_dynamic_bodies_in_order_of_insertion_then_the_static_o
             assert row.tolist() == [*body.position, body.angle, *body.velocity, body.angular_velocity]
 
 
+def test_batch_reads_of_as_many_bodies_stay_in_the_same_memory():
+    space, bodies = _mixed_space()
+    buffer = batch.Buffer()
+    batch.get_space_bodies(space, batch.BodyFields.POSITION, buffer)
+    rows = np.frombuffer(buffer.float_buf()).reshape(-1, 2)
+    for k in range(50):
+        bodies[k % 4].position = (k, -k)
+        buffer.clear()
+        batch.get_space_bodies(space, batch.BodyFields.POSITION, buffer)
+        assert rows[k % 4].tolist() == [k, -k]
+        assert np.frombuffer(buffer.float_buf()).ctypes.data == rows.ctypes.data
+
+
 def test_batch_write_sets_forces_and_torques_in_the_same_order():
     space, bodies = _mixed_space()
     values = np.arange(15, dtype=float).reshape(5, 3)
