@@ -23,8 +23,6 @@ SUCCESS_FRACTION = 0.95
 """An episode succeeds with this fraction of the sheep in the goal."""
 SUCCESS_SECONDS = 5.0
 """With ``terminate_on_success`` it ends when that held for so long [s]."""
-TRAIL_STEPS = 150
-"""Control steps of the shepherds' trails in a picture."""
 
 
 class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
@@ -98,6 +96,7 @@ class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     | lidar | ``"default"`` | a `Lidar`; ``None``: no scan is made and observations are empty, (P, 0) |
     | render_mode | ``None`` | ``"rgb_array"``: pictures of ``render_size`` pixels |
     | render_size | ``(640, 640)`` | width and height |
+    | trail_steps | 150 | control steps of the shepherds' trails in a picture |
 
     ## Version history
 
@@ -113,6 +112,7 @@ class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         lidar: Lidar | Literal["default"] | None = "default",
         render_mode: str | None = None,
         render_size: tuple[int, int] = (640, 640),
+        trail_steps: int = 150,
     ) -> None:
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise SettingsError(f"render_mode: {render_mode!r} is not one of {self.metadata['render_modes']}")
@@ -151,7 +151,7 @@ class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         }
         self._success_steps = round(SUCCESS_SECONDS / self.scenario.control_dt)
         self._held = 0
-        self._trails: deque[Floats] = deque(maxlen=TRAIL_STEPS)
+        self._trails: deque[Floats] = deque(maxlen=trail_steps)
         self._start: Floats | None = None
         self._scan: Scan | None = None
 

@@ -357,7 +357,13 @@ def draw_episode(point: Point, seed: int, path: Path) -> None:
     from shepherd_phys.render import save_png
 
     controller = find_controller(point.controller)
-    make_env = partial(ShepherdingEnv, point.scenario, render_mode="rgb_array", render_size=PICTURE_SIZE)
+    make_env = partial(
+        ShepherdingEnv,
+        point.scenario,
+        render_mode="rgb_array",
+        render_size=PICTURE_SIZE,
+        trail_steps=point.scenario.n_steps,
+    )
     env = make_env(rewards={}, lidar=controller.lidar)
     with contextlib.redirect_stdout(sys.stderr):
         run_episode(controller, env, seed)

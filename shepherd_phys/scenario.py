@@ -22,7 +22,6 @@ from shepherd_phys.settings import (
     write_toml,
 )
 
-
 OPEN_SUBSTEPS = 2
 """In a control step of an open world: with one, driven sheep run right through one another (measured)."""
 OBSTACLE_SUBSTEPS = 3
