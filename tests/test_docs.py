@@ -40,7 +40,7 @@ def test_commands_are_understood(page, line, tmp_path):
     """With --help behind them: every name of a command and flag exists."""
     words = line.split("#")[0].split()[1:]
     done = subprocess.run(
-        [sys.executable, "-P", "-m", "shepherd_phys.scripts.main", *words, "--help"],
+        [str(Path(sys.executable).parent / "shepherd-phys"), *words, "--help"],
         cwd=tmp_path,
         capture_output=True,
         text=True,
