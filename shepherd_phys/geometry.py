@@ -48,6 +48,9 @@ OBSTACLE_CATEGORY = 4
 HIDDEN_CATEGORY = 8
 """Category of sheep that a scan of a part of the sheep leaves out, during that scan only."""
 
+CLEARANCE = 1e-3
+"""Gap that `Geometry.push_out` leaves [m]."""
+
 Owned = tuple[pymunk.Shape, int, int]
 """A shape, the row of its body among the poses (sheep first, then shepherds; -1: it stands still), its channel."""
 
@@ -90,6 +93,23 @@ class Geometry:
                 directions = np.array([info.gradient for info in found]).reshape(-1, 1, 2)
                 away = np.concatenate((away, directions), axis=1)
         return distance, away
+
+    def push_out(self, pos: NDArray[np.float64], radius: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Discs moved out of the shape that stands still and that each is deepest in, just clear of it.
+
+        Args:
+            pos: (M, 2) centres [m].
+            radius: (M,) [m].
+
+        Returns:
+            (M, 2) centres [m].
+        """
+        distance, away = self.static_distances(pos)
+        depth = radius[:, None] - distance
+        deepest = depth.argmax(axis=1)
+        rows = np.arange(len(pos))
+        by = depth[rows, deepest]
+        return np.asarray(pos + np.where(by > 0, by + CLEARANCE, 0.0)[:, None] * away[rows, deepest])
 
 
 def compile_shapes(shapes: Iterable[Owned]) -> Geometry:

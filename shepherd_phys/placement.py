@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from shepherd_phys.neighbours import build, one_cell
+from shepherd_phys.cells import build, one_cell
 from shepherd_phys.settings import SettingsError
 
 Floats = NDArray[np.float64]

@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from functools import partial
 from typing import Any
 
-import numba
 import numpy as np
 import pymunk
 from numpy.typing import ArrayLike, NDArray
 from pymunk import batch
 
+from shepherd_phys import _motion
 from shepherd_phys.bodies import Disc, built
 from shepherd_phys.geometry import (
     OBSTACLE_CATEGORY,
@@ -46,8 +45,6 @@ RELAX_SWEEPS = 1_000
 
 PLACE_TRIES = 200
 """Draws of a placement among obstacles after which it is given up."""
-CLEARANCE = 1e-3
-"""Gap that placing leaves between a body and an obstacle [m]."""
 
 HASH_FROM = 1_000
 """Bodies from which the engine finds contacts by a spatial hash and not by its tree: a quarter faster among 10,000. Not
@@ -139,7 +136,7 @@ class World:
         pos = relax(
             np.concatenate([sheep_pos, shepherd_pos]),
             np.array([reach for _, _, reach in bodies]),
-            push_out=partial(_out_of, solids) if static else None,
+            push_out=solids.push_out if static else None,
             max_sweeps=RELAX_SWEEPS,
         )
         angle = self._noise.uniform(0.0, 2 * np.pi, self._n)
@@ -319,7 +316,7 @@ class World:
         if wanted.shape != (self._n, 2):
             raise ValueError(f"flock model: velocities need shape ({self._n}, 2) (given: {wanted.shape})")
         command = self._command
-        bad = _command(wanted, self._sheep_speed, action, self._speed, command)
+        bad = _motion.command_all(wanted, self._sheep_speed, action, self._speed, command)
         if bad:
             who = "action" if bad == 1 else f"velocities of the flock model ({type(scenario.flock).__name__})"
             raise NonFiniteError(f"{who}: every number must be finite")
@@ -329,7 +326,7 @@ class World:
         for substep in range(substeps):
             if self._followers:
                 command = self._follow(rows, h)
-            _servo(
+            _motion.servo(
                 rows,
                 command,
                 self._mass,
@@ -384,7 +381,7 @@ class World:
         pos, vel, turned, distance = np.empty((n, 2)), np.empty((n, 2)), np.empty((n, 2)), np.empty(n)
         inside, ever = np.empty(n, np.bool_), np.empty(n, np.bool_)
         at, at_vel, angle, walked = np.empty((p, 2)), np.empty((p, 2)), np.empty(p), np.empty(p)
-        if not _measure(
+        if not _motion.measure(
             rows, self._command, heading, arrived, previous, path, self._goal, scenario.goal_radius,
             pos, vel, turned, distance, inside, ever, at, at_vel, angle, walked, self._poses,
         ):  # fmt: skip
@@ -433,89 +430,3 @@ class World:
             self._sensor = sensor
         masks: Mapping[str, NDArray[np.bool_]] = {name: SHEEP_SETS[name](state) for name in sets}
         return sensor.scan(self._poses, state.goal_pos, state.goal_radius, masks)
-
-
-def _out_of(solids: Geometry, pos: Floats, radius: Floats) -> Floats:
-    """Bodies (M, 2) moved out of the obstacle that each is deepest in, just clear of it."""
-    distance, away = solids.static_distances(pos)
-    depth = radius[:, None] - distance
-    deepest = depth.argmax(axis=1)
-    rows = np.arange(len(pos))
-    by = depth[rows, deepest]
-    return np.asarray(pos + np.where(by > 0, by + CLEARANCE, 0.0)[:, None] * away[rows, deepest])
-
-
-@numba.njit(cache=True)
-def _command(wanted, sheep_speed, action, speed, command):  # type: ignore[no-untyped-def]
-    """Write all wanted velocities; 0 if they are finite, 1 if the action is not, 2 if the flock's are not."""
-    n = len(wanted)
-    for k in range(len(action)):
-        x, y = action[k, 0], action[k, 1]
-        length = math.hypot(x, y)
-        if not math.isfinite(x) or not math.isfinite(y):
-            return 1
-        if length > 1.0:  # a length that overflowed to infinity still has a direction
-            scale = max(abs(x), abs(y))
-            x, y = x / scale, y / scale
-            length = math.hypot(x, y)
-            x, y = x / length, y / length
-        command[n + k, 0] = x * speed[k]
-        command[n + k, 1] = y * speed[k]
-    for i in range(n):
-        if not math.isfinite(wanted[i, 0]) or not math.isfinite(wanted[i, 1]):
-            return 2
-        command[i, 0] = wanted[i, 0]
-        command[i, 1] = wanted[i, 1]
-    return 0
-
-
-@numba.njit(cache=True)
-def _servo(rows, command, mass, moment, h, limit, spin_limit, spins, force):  # type: ignore[no-untyped-def]
-    """F = m (v* - v) / h, no longer than m times the limit; torque likewise."""
-    v = 3 if spins else 2
-    for i in range(len(command)):
-        ax = (command[i, 0] - rows[i, v]) / h
-        ay = (command[i, 1] - rows[i, v + 1]) / h
-        size = math.sqrt(ax * ax + ay * ay)
-        scale = mass[i] * (limit / size if size > limit else 1.0)
-        force[i, 0] = ax * scale
-        force[i, 1] = ay * scale
-        if spins:
-            turn = min(max((command[i, 2] - rows[i, 5]) / h, -spin_limit), spin_limit)
-            force[i, 2] = turn * moment[i] if math.isfinite(moment[i]) else 0.0
-
-
-@numba.njit(cache=True)
-def _measure(  # type: ignore[no-untyped-def]
-    rows, command, heading, arrived, previous, path, goal, goal_radius,
-    pos, vel, turned, distance, inside, ever, at, at_vel, angle, walked, poses,
-):  # fmt: skip
-    """Write positions, velocities, headings, distances to the goal, who is in it, what shepherds walked; all finite?"""
-    n, p = len(pos), len(at)
-    spins = rows.shape[1] == 6
-    v = 3 if spins else 2
-    total = 0.0  # not finite as soon as one of its terms is not
-    for i in range(n):
-        x, y = rows[i, 0], rows[i, 1]
-        pos[i, 0], pos[i, 1] = x, y
-        poses[i, 0], poses[i, 1], poses[i, 2] = x, y, rows[i, 2] if spins else 0.0
-        vel[i, 0], vel[i, 1] = rows[i, v], rows[i, v + 1]
-        total += x + y + vel[i, 0] + vel[i, 1]
-        # a sheep that stands still keeps the direction that it was last commanded
-        cx, cy = command[i, 0], command[i, 1]
-        length = math.sqrt(cx * cx + cy * cy)
-        turned[i, 0] = cx / length if length > 0.0 else heading[i, 0]
-        turned[i, 1] = cy / length if length > 0.0 else heading[i, 1]
-        d = math.sqrt((x - goal[0]) ** 2 + (y - goal[1]) ** 2)
-        inside[i] = d <= goal_radius
-        distance[i] = max(d - goal_radius, 0.0)
-        ever[i] = arrived[i] or inside[i]
-    for k in range(p):
-        x, y = rows[n + k, 0], rows[n + k, 1]
-        at[k, 0], at[k, 1] = x, y
-        at_vel[k, 0], at_vel[k, 1] = rows[n + k, v], rows[n + k, v + 1]
-        angle[k] = rows[n + k, 2] if spins else 0.0
-        poses[n + k, 0], poses[n + k, 1], poses[n + k, 2] = x, y, angle[k]
-        total += x + y + at_vel[k, 0] + at_vel[k, 1] + angle[k]
-        walked[k] = path[k] + math.sqrt((x - previous[k, 0]) ** 2 + (y - previous[k, 1]) ** 2)
-    return math.isfinite(total)

@@ -14,7 +14,7 @@ FOLDERS = ("shepherd_phys", "envs", "controllers", "scripts")
 # A module imports from the lines above its own and from its own. Obstacles stand above the state because
 # a state carries those of its world.
 ORDER = (
-    ("settings", "neighbours", "workers", "_frames", "_shapes", "_raycast"),
+    ("settings", "cells", "neighbours", "workers", "_frames", "_motion", "_shapes", "_raycast"),
     ("bodies", "obstacles"),
     ("state",),
     ("geometry", "placement"),

@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shepherd_phys.neighbours import CELLS_PER_POINT, build, build_for, nearest, surroundings, threshold
+from shepherd_phys.cells import CELLS_PER_POINT, build, build_for
+from shepherd_phys.neighbours import nearest, surroundings, threshold
 
 
 def naive(pos, n):

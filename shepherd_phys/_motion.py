@@ -1,0 +1,83 @@
+"""Kernels of a control step: what is wanted as commands, commands as forces, what was read as a state."""
+
+from __future__ import annotations
+
+import math
+
+import numba
+
+
+@numba.njit(cache=True)
+def command_all(wanted, sheep_speed, action, speed, command):  # type: ignore[no-untyped-def]
+    """Write all wanted velocities; 0 if they are finite, 1 if the action is not, 2 if the flock's are not."""
+    n = len(wanted)
+    for k in range(len(action)):
+        x, y = action[k, 0], action[k, 1]
+        length = math.hypot(x, y)
+        if not math.isfinite(x) or not math.isfinite(y):
+            return 1
+        if length > 1.0:  # a length that overflowed to infinity still has a direction
+            scale = max(abs(x), abs(y))
+            x, y = x / scale, y / scale
+            length = math.hypot(x, y)
+            x, y = x / length, y / length
+        command[n + k, 0] = x * speed[k]
+        command[n + k, 1] = y * speed[k]
+    for i in range(n):
+        if not math.isfinite(wanted[i, 0]) or not math.isfinite(wanted[i, 1]):
+            return 2
+        command[i, 0] = wanted[i, 0]
+        command[i, 1] = wanted[i, 1]
+    return 0
+
+
+@numba.njit(cache=True)
+def servo(rows, command, mass, moment, h, limit, spin_limit, spins, force):  # type: ignore[no-untyped-def]
+    """F = m (v* - v) / h, no longer than m times the limit; torque likewise."""
+    v = 3 if spins else 2
+    for i in range(len(command)):
+        ax = (command[i, 0] - rows[i, v]) / h
+        ay = (command[i, 1] - rows[i, v + 1]) / h
+        size = math.sqrt(ax * ax + ay * ay)
+        scale = mass[i] * (limit / size if size > limit else 1.0)
+        force[i, 0] = ax * scale
+        force[i, 1] = ay * scale
+        if spins:
+            turn = min(max((command[i, 2] - rows[i, 5]) / h, -spin_limit), spin_limit)
+            force[i, 2] = turn * moment[i] if math.isfinite(moment[i]) else 0.0
+
+
+@numba.njit(cache=True)
+def measure(  # type: ignore[no-untyped-def]
+    rows, command, heading, arrived, previous, path, goal, goal_radius,
+    pos, vel, turned, distance, inside, ever, at, at_vel, angle, walked, poses,
+):  # fmt: skip
+    """Write positions, velocities, headings, distances to the goal, who is in it, what shepherds walked; all finite?"""
+    n, p = len(pos), len(at)
+    spins = rows.shape[1] == 6
+    v = 3 if spins else 2
+    total = 0.0  # not finite as soon as one of its terms is not
+    for i in range(n):
+        x, y = rows[i, 0], rows[i, 1]
+        pos[i, 0], pos[i, 1] = x, y
+        poses[i, 0], poses[i, 1], poses[i, 2] = x, y, rows[i, 2] if spins else 0.0
+        vel[i, 0], vel[i, 1] = rows[i, v], rows[i, v + 1]
+        total += x + y + vel[i, 0] + vel[i, 1]
+        # a sheep that stands still keeps the direction that it was last commanded
+        cx, cy = command[i, 0], command[i, 1]
+        length = math.sqrt(cx * cx + cy * cy)
+        turned[i, 0] = cx / length if length > 0.0 else heading[i, 0]
+        turned[i, 1] = cy / length if length > 0.0 else heading[i, 1]
+        d = math.sqrt((x - goal[0]) ** 2 + (y - goal[1]) ** 2)
+        inside[i] = d <= goal_radius
+        distance[i] = max(d - goal_radius, 0.0)
+        ever[i] = arrived[i] or inside[i]
+    for k in range(p):
+        x, y = rows[n + k, 0], rows[n + k, 1]
+        at[k, 0], at[k, 1] = x, y
+        at_vel[k, 0], at_vel[k, 1] = rows[n + k, v], rows[n + k, v + 1]
+        angle[k] = rows[n + k, 2] if spins else 0.0
+        poses[n + k, 0], poses[n + k, 1], poses[n + k, 2] = x, y, angle[k]
+        total += x + y + at_vel[k, 0] + at_vel[k, 1] + angle[k]
+        walked[k] = path[k] + math.sqrt((x - previous[k, 0]) ** 2 + (y - previous[k, 1]) ** 2)
+    return math.isfinite(total)
