@@ -11,7 +11,7 @@ unexport PYTHONPATH PYTHONHOME PYTHONSTARTUP VIRTUAL_ENV PIP_USER PIP_TARGET PIP
 export PYTHONSAFEPATH := 1
 
 .DELETE_ON_ERROR:
-.PHONY: help run test test-slow lint format benchmark lock clean .venv FORCE
+.PHONY: help run test test-slow lint format benchmark lock clean clean-kernels .venv FORCE
 
 help:  ## this list
 	@sed -n 's/^\([a-z.-]*\):[^#]*##  *\(.*\)/\1|\2/p' $(MAKEFILE_LIST) | while IFS='|' read -r name text; do printf '  make %-10s %s\n' "$$name" "$$text"; done
@@ -65,6 +65,9 @@ lock: build/.installed  ## write requirements.lock anew, keeping the versions it
 		--no-build-isolation --no-annotate --no-emit-index-url --no-emit-find-links --no-emit-trusted-host \
 		$(if $(UPGRADE),--upgrade) --output-file requirements.lock pyproject.toml
 	sed -i.old -e 's/+cpu$$//' -e '/^pip==/d' requirements.lock && rm requirements.lock.old
+
+clean-kernels:  ## forget numba's compiled kernels
+	find shepherd_phys envs build -name '*.nb[ic]' -exec rm -f {} +
 
 clean:  ## remove everything that was made, results and runs excepted
 	rm -rf .venv build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .benchmarks
