@@ -38,10 +38,9 @@ class Random:
     lidar = None
 
     def __init__(self, hold: int = 10) -> None:
-        if hold < 1:
-            raise SettingsError(f"Random.hold: must be at least 1 (given: {hold})")
+        if not isinstance(hold, int) or hold < 1:
+            raise SettingsError(f"Random.hold: must be a whole number of at least 1 (given: {hold!r})")
         self.hold = hold
-        self.reset(np.random.default_rng(0))
 
     def reset(self, rng: np.random.Generator) -> None:
         """Take the episode's generator."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from pathlib import Path
 from typing import Any, Literal, SupportsFloat
@@ -12,15 +13,13 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from shepherd_phys.lidar import CHANNELS, Lidar, Scan, Stack, encode
-from shepherd_phys.scenario import Scenario, load_scenario
+from shepherd_phys.scenario import SUCCESS_FRACTION, Scenario, load_scenario
 from shepherd_phys.settings import SettingsError
 from shepherd_phys.state import Floats, WorldState
-from shepherd_phys.world import SHEEP_SETS, World
+from shepherd_phys.world import SHEEP_SETS, NonFiniteError, World
 
 from .rewards import SCHEMES, Scheme
 
-SUCCESS_FRACTION = 0.95
-"""An episode succeeds with this fraction of the sheep in the goal."""
 SUCCESS_SECONDS = 5.0
 """With ``terminate_on_success`` it ends when that held for so long [s]."""
 
@@ -114,6 +113,8 @@ class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         render_size: tuple[int, int] = (640, 640),
         trail_steps: int = 150,
     ) -> None:
+        if trail_steps < 0:
+            raise SettingsError(f"trail_steps: must not be negative (given: {trail_steps})")
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise SettingsError(f"render_mode: {render_mode!r} is not one of {self.metadata['render_modes']}")
         self.scenario = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
@@ -135,7 +136,9 @@ class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._sets = tuple(name for name in SHEEP_SETS if name in wanted)
         seen = lidar.channels if lidar is not None else ()
         channels = tuple(name for name in CHANNELS if name in wanted or name in seen)
-        self._scan_lidar = (lidar or Lidar()).but(channels=channels) if channels or self._sets else None
+        if self._sets and not channels:
+            channels = CHANNELS[:1]  # a lidar has at least one channel
+        self._scan_lidar = (lidar or Lidar()).but(channels=channels) if channels else None
 
         n_shepherds = self.scenario.n_shepherds
         shape = lidar.observation_shape(n_shepherds) if lidar is not None else (n_shepherds, 0)
@@ -149,8 +152,7 @@ class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             for name, (_, term) in self._scheme.items()
             if hasattr(term, "shares")
         }
-        self._success_steps = round(SUCCESS_SECONDS / self.scenario.control_dt)
-        self._held = 0
+        self._success_since: float | None = None
         self._trails: deque[Floats] = deque(maxlen=trail_steps)
         self._start: Floats | None = None
         self._scan: Scan | None = None
@@ -178,7 +180,7 @@ class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         if options:
             raise SettingsError(f"options: none are known (given: {sorted(options)})")
         state = self.world.reset(int(self.np_random.integers(2**63)) if seed is None else seed)
-        self._held = 0
+        self._success_since = None
         self.beam_offset = np.zeros(self.scenario.n_shepherds, dtype=np.int64)
         self._trails.clear()
         self._start = state.sheep_pos
@@ -188,13 +190,16 @@ class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         zeros = {f"reward/{name}": 0.0 for name in self._scheme}
         for keys in self._share_keys.values():
             zeros.update(dict.fromkeys(keys, 0.0))
-        return self._observe(), {**self._measures(state), **zeros}
+        info = {**self._measures(state), **zeros}
+        self._held(state, info["is_success"])
+        return self._observe(), info
 
     def step(self, action: Any) -> tuple[NDArray[np.float32], SupportsFloat, bool, bool, dict[str, Any]]:
         """One control step.
 
         Raises:
-            ValueError: the action has another shape or holds a NaN or an infinity; nothing has moved.
+            ValueError: the action has another shape; or, as `NonFiniteError`, holds a NaN or an infinity. Nothing has
+                moved then.
         """
         before = self.world.state
         if before.step >= self.scenario.n_steps:
@@ -207,19 +212,37 @@ class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         reward = 0.0
         for name, (weight, term) in self._scheme.items():
             if name in self._share_keys:
-                shares = term.shares(before, after, self._scan, self.scenario)  # type: ignore[attr-defined]
+                shares = np.asarray(term.shares(before, after, self._scan, self.scenario))  # type: ignore[attr-defined]
+                if shares.shape != (after.n_shepherds,):
+                    raise ValueError(
+                        f"rewards[{name!r}].shares: needs shape ({after.n_shepherds},) (given: {shares.shape})"
+                    )
                 own = shares.tolist()
                 value = sum(own) / max(len(own), 1)
                 info.update(zip(self._share_keys[name], own, strict=True))
             else:
                 value = term(before, after, self._scan, self.scenario)
-            weighted = float(weight * value)
+            try:
+                weighted = weight * float(value)
+            except (TypeError, ValueError):
+                raise ValueError(f"rewards[{name!r}]: the term must give a number (given: {value!r})") from None
+            if not math.isfinite(weighted):
+                raise NonFiniteError(f"rewards[{name!r}]: the term gave {value}, which is not finite")
             info[f"reward/{name}"] = weighted
             reward += weighted
-        self._held = self._held + 1 if info["is_success"] else 0
-        terminated = self.scenario.terminate_on_success and self._held >= self._success_steps
+        held = self._held(after, info["is_success"])
+        terminated = self.scenario.terminate_on_success and held
         truncated = after.step >= self.scenario.n_steps
         return self._observe(), reward, terminated, truncated, info
+
+    def _held(self, state: WorldState, success: bool) -> bool:
+        """Whether the episode has been a success for long enough."""
+        if not success:
+            self._success_since = None
+            return False
+        if self._success_since is None:
+            self._success_since = state.time
+        return state.time - self._success_since >= SUCCESS_SECONDS - 1e-9
 
     def render(self) -> NDArray[np.uint8] | None:
         """A picture (height, width, 3) of the state, or None without a render mode."""
@@ -232,7 +255,7 @@ class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             self.render_size,
             trails=list(self._trails),
             start=self._start,
-            influence_radius=getattr(self.scenario.flock, "detection_radius", None),
+            influence_radius=getattr(self.scenario.flock, "detection_radius", None) or None,
         )
 
     def _look(self) -> Scan | None:

@@ -8,14 +8,14 @@ import numba
 
 
 @numba.njit(cache=True)
-def command_all(wanted, sheep_speed, action, speed, command):  # type: ignore[no-untyped-def]
-    """Write all wanted velocities; 0 if they are finite, 1 if the action is not, 2 if the flock's are not."""
-    n = len(wanted)
+def command_shepherds(action, speed, command):  # type: ignore[no-untyped-def]
+    """Write the wanted velocities of the shepherds, the last rows of ``command``; whether the action is finite."""
+    n = len(command) - len(action)
     for k in range(len(action)):
         x, y = action[k, 0], action[k, 1]
         length = math.hypot(x, y)
         if not math.isfinite(x) or not math.isfinite(y):
-            return 1
+            return False
         if length > 1.0:  # a length that overflowed to infinity still has a direction
             scale = max(abs(x), abs(y))
             x, y = x / scale, y / scale
@@ -23,12 +23,18 @@ def command_all(wanted, sheep_speed, action, speed, command):  # type: ignore[no
             x, y = x / length, y / length
         command[n + k, 0] = x * speed[k]
         command[n + k, 1] = y * speed[k]
-    for i in range(n):
+    return True
+
+
+@numba.njit(cache=True)
+def command_sheep(wanted, command):  # type: ignore[no-untyped-def]
+    """Write the wanted velocities of the sheep, the first rows of ``command``; whether they are finite."""
+    for i in range(len(wanted)):
         if not math.isfinite(wanted[i, 0]) or not math.isfinite(wanted[i, 1]):
-            return 2
+            return False
         command[i, 0] = wanted[i, 0]
         command[i, 1] = wanted[i, 1]
-    return 0
+    return True
 
 
 @numba.njit(cache=True)
@@ -36,12 +42,18 @@ def servo(rows, command, mass, moment, h, limit, spin_limit, spins, force):  # t
     """F = m (v* - v) / h, no longer than m times the limit; torque likewise."""
     v = 3 if spins else 2
     for i in range(len(command)):
-        ax = (command[i, 0] - rows[i, v]) / h
-        ay = (command[i, 1] - rows[i, v + 1]) / h
-        size = math.sqrt(ax * ax + ay * ay)
-        scale = mass[i] * (limit / size if size > limit else 1.0)
-        force[i, 0] = ax * scale
-        force[i, 1] = ay * scale
+        dx, dy = command[i, 0] - rows[i, v], command[i, 1] - rows[i, v + 1]
+        big = max(abs(dx), abs(dy))
+        if big > limit * h:  # scaled before it is squared: a huge wish must not overflow
+            dx, dy = dx / big, dy / big
+            length = math.sqrt(dx * dx + dy * dy)
+            dx, dy = dx / length * (limit * h), dy / length * (limit * h)
+        else:
+            length = math.sqrt(dx * dx + dy * dy)
+            if length > limit * h:
+                dx, dy = dx / length * (limit * h), dy / length * (limit * h)
+        force[i, 0] = mass[i] * dx / h
+        force[i, 1] = mass[i] * dy / h
         if spins:
             turn = min(max((command[i, 2] - rows[i, 5]) / h, -spin_limit), spin_limit)
             force[i, 2] = turn * moment[i] if math.isfinite(moment[i]) else 0.0

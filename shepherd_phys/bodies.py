@@ -7,6 +7,7 @@ is its own business. A user adds one by writing a class with the members of `Bod
 from __future__ import annotations
 
 import math
+import numbers
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -91,10 +92,18 @@ def built(body: Body, who: str) -> tuple[pymunk.Body, list[pymunk.Shape], float]
     for member in ("build", "follow", "max_speed"):
         if not hasattr(body, member):
             raise SettingsError(f"{name}: a body needs {member!r}; see shepherd_phys.bodies.Body")
-    if not (math.isfinite(body.max_speed) and body.max_speed > 0):
-        raise SettingsError(f"{name}.max_speed: must be finite and above 0 (given: {body.max_speed})")
-    made, shapes = body.build()
-    shapes = list(shapes)
+    speed = body.max_speed
+    if not (isinstance(speed, numbers.Real) and math.isfinite(speed) and speed > 0):
+        raise SettingsError(f"{name}.max_speed: must be a finite number above 0 (given: {speed!r})")
+    answer = body.build()
+    try:
+        made, shapes = answer
+        shapes = list(shapes)
+        fits = isinstance(made, pymunk.Body) and all(isinstance(shape, pymunk.Shape) for shape in shapes)
+    except (TypeError, ValueError):
+        fits = False
+    if not fits:
+        raise SettingsError(f"{name}.build: needs a pymunk.Body and a list of its shapes (given: {answer!r})")
     if made.body_type != pymunk.Body.DYNAMIC:
         raise SettingsError(f"{name}.build: the body must be dynamic")
     if made.space is not None:

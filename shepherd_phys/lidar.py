@@ -77,7 +77,8 @@ class Lidar(Settings):
     obstacles_cut: bool = True
     """Obstacles cut off every channel behind them, observed or not."""
     engine: Literal["auto", "pymunk", "kernel"] = "auto"
-    """"auto": the kernel where it knows every shape, else segment queries."""
+    """"auto": the kernel where it knows every shape, else segment queries. Among 1,000 bodies and more the engine keeps
+    a grid, and queries may lose a beam that runs exactly through its corners: along an axis from a round number."""
 
     def __post_init__(self) -> None:
         if self.sectors is not None and self.beams % self.sectors:
@@ -373,4 +374,4 @@ def turn(action: NDArray[Any], offset: NDArray[np.int64], beams: int) -> NDArray
     angle = (2.0 * np.pi / beams) * offset
     ca, sa = np.cos(angle), np.sin(angle)
     x, y = action[..., 0], action[..., 1]
-    return np.stack((ca * x - sa * y, sa * x + ca * y), axis=-1).astype(action.dtype, copy=False)
+    return np.stack((ca * x - sa * y, sa * x + ca * y), axis=-1)

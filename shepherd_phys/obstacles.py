@@ -116,10 +116,18 @@ def solid(obstacle: Obstacle, index: int, body: pymunk.Body) -> list[pymunk.Shap
     name = f"obstacles[{index}] ({kind_of(obstacle)})"
     if not hasattr(obstacle, "shapes"):
         raise SettingsError(f"{name}: an obstacle needs 'shapes'; see shepherd_phys.obstacles.Obstacle")
-    shapes = list(obstacle.shapes(body))
+    answer = obstacle.shapes(body)
+    if not isinstance(answer, list | tuple) or not all(isinstance(shape, pymunk.Shape) for shape in answer):
+        raise SettingsError(f"{name}.shapes: needs a list of pymunk shapes (given: {answer!r})")
+    shapes = list(answer)
     if not shapes:
         raise SettingsError(f"{name}.shapes: gave no shape")
     for shape in shapes:
+        if not isinstance(shape, pymunk.Poly) and not shape.radius >= MIN_THICKNESS / 2:
+            raise SettingsError(
+                f"{name}.shapes: a {type(shape).__name__} must be at least {MIN_THICKNESS} m thick, or bodies get "
+                f"through (given: radius {shape.radius} m)"
+            )
         if shape.body is not body:
             raise SettingsError(f"{name}.shapes: {type(shape).__name__} is not attached to the body it was given")
         box = shape.cache_bb()

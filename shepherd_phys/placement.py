@@ -105,8 +105,7 @@ def relax(
         max_sweeps: sweeps before giving up.
 
     Returns:
-        (M, 2) centres [m]: every two discs are at least the sum of their radii apart, and ``push_out`` was the last
-        to move any.
+        (M, 2) centres [m]: every two discs are at least the sum of their radii apart, and ``push_out`` moves none.
 
     Raises:
         PlacementError: overlaps remain (two fixed bodies that overlap always do).
@@ -122,15 +121,17 @@ def relax(
         overlapping = _sweeps(placed, radius, free, max_sweeps)
     else:
         for _ in range(max_sweeps):
-            placed = np.where(free[:, None], push_out(placed, radius), placed)
-            overlapping = _sweeps(placed, radius, free, 1)
+            pushed = np.where(free[:, None], push_out(placed, radius), placed)
+            inside = int((pushed != placed).any(axis=1).sum())  # what parted bodies may have been pushed back into
+            placed = np.ascontiguousarray(pushed)
+            overlapping = max(_sweeps(placed, radius, free, 1), inside)
             if overlapping == 0:
                 break
     if overlapping:
         raise PlacementError(
-            f"{overlapping} of {len(pos)} bodies still overlap after {max_sweeps} sweeps: n_sheep, flock_sd, n_flocks, "
-            "flock_distance, obstacles and the bodies' radii leave too little room; fewer or smaller bodies, "
-            "or a larger flock_sd, make some"
+            f"{overlapping} of {len(pos)} bodies still overlap another or an obstacle after {max_sweeps} sweeps: "
+            "n_sheep, flock_sd, n_flocks, flock_distance, obstacles and the bodies' radii leave too little room; fewer "
+            "or smaller bodies, or a larger flock_sd, make some"
         )
     return placed
 

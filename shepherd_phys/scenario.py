@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numbers
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -22,6 +23,8 @@ from shepherd_phys.settings import (
     write_toml,
 )
 
+SUCCESS_FRACTION = 0.95
+"""An episode succeeds with this fraction of the sheep in the goal."""
 OPEN_SUBSTEPS = 2
 """In a control step of an open world: with one, driven sheep run right through one another (measured)."""
 OBSTACLE_SUBSTEPS = 3
@@ -30,10 +33,10 @@ OBSTACLE_SUBSTEPS = 3
 
 def _team(value: Any) -> Any:
     """A number of shepherds means that many default discs."""
-    if isinstance(value, int) and not isinstance(value, bool):
-        if not 0 <= value <= 10_000:
+    if isinstance(value, numbers.Integral) and not isinstance(value, bool):
+        if not 0 <= int(value) <= 10_000:
             raise ValueError("a number of shepherds lies in 0..10000")
-        return (Disc(),) * value
+        return (Disc(),) * int(value)
     if isinstance(value, list | tuple):
         return tuple(value)
     raise ValueError("give bodies, or how many default discs there are")
@@ -41,7 +44,8 @@ def _team(value: Any) -> Any:
 
 def _interval(value: Any) -> Any:
     """Two numbers, the smaller first."""
-    if isinstance(value, list | tuple) and len(value) == 2 and value[0] > value[1]:
+    pair = isinstance(value, list | tuple) and len(value) == 2 and all(isinstance(v, numbers.Real) for v in value)
+    if pair and value[0] > value[1]:
         raise ValueError("the smaller number comes first")
     return value
 

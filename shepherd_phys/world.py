@@ -7,6 +7,7 @@ one compiled call for the flock, one for the servo, one for the measures of the 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
@@ -57,8 +58,32 @@ _LINEAR = batch.BodyFields.POSITION | batch.BodyFields.VELOCITY
 _POSES = _LINEAR | batch.BodyFields.ANGLE | batch.BodyFields.ANGULAR_VELOCITY
 
 
-class NonFiniteError(FloatingPointError):
+class NonFiniteError(FloatingPointError, ValueError):
     """A number that is not finite was about to reach the engine, or came out of it."""
+
+
+class _Contacts:
+    """Counts new contacts of shepherds with obstacles and with one another in one Space.
+
+    Engines report pairs of shapes; here bodies and obstacles count, each pair once however many shapes they have.
+    """
+
+    def __init__(self, owners: dict[pymunk.Shape, int]) -> None:
+        self.count = 0
+        self._owners = owners
+        self._touching: Counter[tuple[int, int]] = Counter()
+
+    def begin(self, arbiter: pymunk.Arbiter, space: pymunk.Space, data: Any) -> None:
+        pair = self._pair(arbiter)
+        self.count += self._touching[pair] == 0
+        self._touching[pair] += 1
+
+    def separate(self, arbiter: pymunk.Arbiter, space: pymunk.Space, data: Any) -> None:
+        self._touching[self._pair(arbiter)] -= 1
+
+    def _pair(self, arbiter: pymunk.Arbiter) -> tuple[int, int]:
+        a, b = (self._owners[shape] for shape in arbiter.shapes)
+        return min(a, b), max(a, b)
 
 
 class World:
@@ -81,6 +106,8 @@ class World:
         for thing in (*scenario.shepherds, scenario.sheep, scenario.flock, *scenario.obstacles):
             if isinstance(thing, Foreign):
                 raise thing.missing()
+            if isinstance(thing, type):
+                raise SettingsError(f"{kind_of(thing)}: a class was given; make one of it: {thing.__name__}()")
         if not hasattr(scenario.flock, "velocities"):
             raise SettingsError(f"flock ({kind_of(scenario.flock)}): a flock model needs 'velocities'")
         self.scenario = scenario
@@ -112,9 +139,10 @@ class World:
             SettingsError: bodies or obstacles cannot be built, or leave no room.
         """
         scenario = self.scenario
+        self._state = None  # a reset that fails leaves no half-made world to step
         placement = self._seed(seed)
         bodies, static = self._new_bodies()
-        solids = compile_shapes([(shape, -1, OBSTACLES) for shape in static])
+        solids = compile_shapes([(shape, -1, OBSTACLES) for shape, _ in static])
         for _ in range(PLACE_TRIES):
             goal, sheep_pos, shepherd_pos = place(
                 placement,
@@ -130,7 +158,7 @@ class World:
                 break
         else:
             raise PlacementError(
-                f"obstacles: in {PLACE_TRIES} draws they left no room for the goal, a shepherd or a flock's middle; "
+                f"obstacles: in {PLACE_TRIES} draws they left no room for the goal, a shepherd or a flock's centroid; "
                 "fewer or smaller ones, a larger box or another goal_pos make some"
             )
         pos = relax(
@@ -152,10 +180,10 @@ class World:
         )
 
     def _has_room(self, solids: Geometry, goal: Floats, sheep_pos: Floats, shepherd_pos: Floats) -> bool:
-        """Whether obstacles leave the goal free (its centre, where it is given), shepherds and flocks' middles, too."""
+        """Whether obstacles leave free the goal (its centre, where it is given), shepherds and flocks' centroids."""
         flock = flock_of(self._n, self.scenario.n_flocks)
-        middles = np.array([sheep_pos[flock == k].mean(axis=0) for k in range(self.scenario.n_flocks)])
-        points = np.concatenate([goal[None], shepherd_pos, middles])
+        centroids = np.array([sheep_pos[flock == k].mean(axis=0) for k in range(self.scenario.n_flocks)])
+        points = np.concatenate([goal[None], shepherd_pos, centroids])
         wanted = np.zeros(len(points))
         if self.scenario.goal_pos is None:
             wanted[0] = self.scenario.goal_radius
@@ -173,29 +201,46 @@ class World:
             ValueError: the state has other numbers of sheep or shepherds than the scenario.
             NonFiniteError: it holds a number that is not finite.
         """
-        if (state.n_sheep, state.n_shepherds) != (self._n, self._p):
+        n, p = self._n, self._p
+        if (state.n_sheep, state.n_shepherds) != (n, p):
             raise ValueError(
-                f"state: needs {self._n} sheep and {self._p} shepherds (given: {state.n_sheep} and {state.n_shepherds})"
+                f"state: needs {n} sheep and {p} shepherds (given: {state.n_sheep} and {state.n_shepherds})"
             )
+        for name, shape in {
+            "goal_pos": (2,),
+            "sheep_pos": (n, 2),
+            "sheep_vel": (n, 2),
+            "sheep_heading": (n, 2),
+            "sheep_arrived": (n,),
+            "shepherd_pos": (p, 2),
+            "shepherd_vel": (p, 2),
+            "shepherd_angle": (p,),
+        }.items():
+            array = getattr(state, name)
+            if array.shape != shape:
+                raise ValueError(f"state.{name}: needs shape {shape} (given: {array.shape})")
+            if not np.isfinite(array).all():
+                raise NonFiniteError(f"state.{name}: every number must be finite")
+        self._state = None
         self._seed(seed)
         bodies, static = self._new_bodies()
         motion = np.zeros((self._n + self._p, 6))
         motion[:, :2] = np.concatenate([state.sheep_pos, state.shepherd_pos])
         motion[self._n :, 2] = state.shepherd_angle
         motion[:, 3:5] = np.concatenate([state.sheep_vel, state.shepherd_vel])
-        if not (np.isfinite(motion).all() and np.isfinite(state.sheep_heading).all()):
-            raise NonFiniteError("state: every position, velocity and heading must be finite")
         return self._start(bodies, static, state.goal_pos, motion, state.sheep_heading, state.sheep_arrived)
 
     def _seed(self, seed: int) -> np.random.Generator:
         """Seed the sheep's noise and the users' stream; the stream of the placement is returned."""
+        if not isinstance(seed, int | np.integer) or seed < 0:
+            raise ValueError(f"seed: needs a whole number that is not negative (given: {seed!r})")
         placement, noise, users = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(3))
         self._noise = noise
         self.user_rng = users
         return placement
 
-    def _new_bodies(self) -> tuple[list[tuple[pymunk.Body, list[pymunk.Shape], float]], list[pymunk.Shape]]:
-        """A fresh Space, the bodies for it in their fixed order, and the obstacles' shapes."""
+    def _new_bodies(self) -> tuple[list[tuple[pymunk.Body, list[pymunk.Shape], float]], list[tuple[pymunk.Shape, int]]]:
+        """A fresh Space, the bodies for it in their fixed order, and shapes of obstacles with the obstacle's index."""
         scenario = self.scenario
         space = pymunk.Space()
         space.iterations = scenario.iterations
@@ -204,7 +249,7 @@ class World:
         bodies = [built(scenario.sheep, "sheep") for _ in range(self._n)]
         bodies += [built(body, f"shepherd {k}") for k, body in enumerate(scenario.shepherds)]
         static = [
-            shape
+            (shape, index)
             for index, obstacle in enumerate(scenario.obstacles)
             for shape in solid(obstacle, index, space.static_body)
         ]
@@ -213,7 +258,7 @@ class World:
     def _start(
         self,
         bodies: list[tuple[pymunk.Body, list[pymunk.Shape], float]],
-        static: list[pymunk.Shape],
+        static: list[tuple[pymunk.Shape, int]],
         goal: Floats,
         motion: Floats,
         heading: Floats,
@@ -235,18 +280,21 @@ class World:
                 shape.collision_type = category
                 self._shapes.append((shape, row, SHEEP if is_sheep else SHEPHERDS))
             space.add(body, *shapes)
-        for shape in static:
+        owners = {shape: row for shape, row, channel in self._shapes if channel == SHEPHERDS}
+        for shape, index in static:
+            owners[shape] = -1 - index
             shape.filter = pymunk.ShapeFilter(categories=OBSTACLE_CATEGORY)
             shape.collision_type = OBSTACLE_CATEGORY
             self._shapes.append((shape, -1, OBSTACLES))
             space.add(shape)
-        self._collisions = 0
+        self._contacts = _Contacts(owners)
         for other in (OBSTACLE_CATEGORY, SHEPHERD_CATEGORY):
-            space.on_collision(SHEPHERD_CATEGORY, other, begin=self._count_collision)
+            space.on_collision(SHEPHERD_CATEGORY, other, begin=self._contacts.begin, separate=self._contacts.separate)
 
         n, p = self._n, self._p
         radius = np.array([reach for _, _, reach in bodies])
-        if n + p >= HASH_FROM:
+        self._geometry = compile_shapes(self._shapes)
+        if n + p >= HASH_FROM and self._geometry.known:
             space.use_spatial_hash(HASH_CELL * float(np.median(radius)), 4 * (n + p))
         self._speed = frozen(np.array([float(body.max_speed) for body in scenario.shepherds]))
         self._sheep_speed = frozen(np.full(n, float(scenario.sheep.max_speed)))
@@ -276,7 +324,7 @@ class World:
         self._command = np.zeros((n + p, 3))
         self._poses = np.zeros((n + p, 3))
         self._force = np.zeros((n_rows, 3 if self._spins else 2))
-        if self._state is None:
+        if "_read_buffer" not in self.__dict__:
             # pymunk never frees batch buffers: made once and used by every Space of this world; not before the first
             # reset, so that a fresh world can be pickled
             self._read_buffer, self._write_buffer = batch.Buffer(), batch.Buffer()
@@ -292,9 +340,6 @@ class World:
         self._state = self._measure(rows, 0, heading, arrived, rows[n : n + p, :2], np.zeros(p))
         return self._state
 
-    def _count_collision(self, arbiter: pymunk.Arbiter, space: pymunk.Space, data: Any) -> None:
-        self._collisions += 1
-
     # ------------------------------------------------------------------- step
 
     def step(self, action: ArrayLike) -> WorldState:
@@ -309,17 +354,26 @@ class World:
         """
         state, scenario = self.state, self.scenario
         space = self.space
-        action = np.asarray(action, dtype=np.float64)
+        try:
+            action = np.asarray(action, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise ValueError(f"action: needs numbers of shape ({self._p}, 2) (given: {action!r})") from None
         if action.shape != (self._p, 2):
             raise ValueError(f"action: needs shape ({self._p}, 2), one row a shepherd (given: {action.shape})")
-        wanted = scenario.flock.velocities(state, self._noise)
-        if wanted.shape != (self._n, 2):
-            raise ValueError(f"flock model: velocities need shape ({self._n}, 2) (given: {wanted.shape})")
         command = self._command
-        bad = _motion.command_all(wanted, self._sheep_speed, action, self._speed, command)
-        if bad:
-            who = "action" if bad == 1 else f"velocities of the flock model ({type(scenario.flock).__name__})"
-            raise NonFiniteError(f"{who}: every number must be finite")
+        # before the flock draws its random numbers: a refused action must change nothing
+        if not _motion.command_shepherds(action, self._speed, command):
+            raise NonFiniteError("action: every number must be finite")
+        flock = type(scenario.flock).__name__
+        wanted = scenario.flock.velocities(state, self._noise)
+        try:
+            wanted = np.asarray(wanted, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise ValueError(f"flock model ({flock}): velocities must be numbers (given: {wanted!r})") from None
+        if wanted.shape != (self._n, 2):
+            raise ValueError(f"flock model ({flock}): velocities need shape ({self._n}, 2) (given: {wanted.shape})")
+        if not _motion.command_sheep(wanted, command):
+            raise NonFiniteError(f"flock model ({flock}): velocities must be finite")
 
         h, substeps = self._h, self._substeps
         rows = self._rows
@@ -356,14 +410,15 @@ class World:
         """Let the bodies that are no plain discs turn what is wanted of them into what they do."""
         followed = self._command.copy()
         for row, body in self._followers:
+            name = type(body).__name__
             pose = rows[row].copy() if self._spins else np.array([*rows[row, :2], 0.0, *rows[row, 2:], 0.0])
-            velocity, spin = body.follow(pose, self._command[row, :2].copy(), h)
-            followed[row, 0], followed[row, 1] = velocity
-            followed[row, 2] = spin
+            answer = body.follow(pose, self._command[row, :2].copy(), h)
+            try:
+                (followed[row, 0], followed[row, 1]), followed[row, 2] = answer
+            except (TypeError, ValueError):
+                raise ValueError(f"{name}.follow: needs a velocity (2,) and a spin (given: {answer!r})") from None
             if not all(map(math.isfinite, followed[row])):
-                raise NonFiniteError(
-                    f"{type(body).__name__}.follow: velocity {velocity} and spin {spin} must be finite"
-                )
+                raise NonFiniteError(f"{name}.follow: velocity and spin must be finite (given: {answer!r})")
         return followed
 
     def _read(self) -> Floats:
@@ -403,7 +458,7 @@ class World:
                 "shepherd_vel": at_vel,
                 "shepherd_angle": angle,
                 "shepherd_path": walked,
-                "collisions": self._collisions,
+                "collisions": self._contacts.count,
             }
         )
 
@@ -425,8 +480,11 @@ class World:
                 for shape, row, channel in self._shapes:
                     if channel == SHEEP:
                         sheep_shapes[row].append(shape)
-                sensor = Sensor(lidar, compile_shapes(self._shapes), self.space, sheep_shapes, self._n, self._p)
+                sensor = Sensor(lidar, self._geometry, self.space, sheep_shapes, self._n, self._p)
                 self._sensors[lidar] = sensor
             self._sensor = sensor
+        for name in sets:
+            if name not in SHEEP_SETS:
+                raise ValueError(f"sets: {name!r} is not one of {', '.join(SHEEP_SETS)}")
         masks: Mapping[str, NDArray[np.bool_]] = {name: SHEEP_SETS[name](state) for name in sets}
         return sensor.scan(self._poses, state.goal_pos, state.goal_radius, masks)

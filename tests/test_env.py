@@ -43,11 +43,9 @@ def test_gymnasium_check_env_without_a_warning(variant):
         check_env(env)
 
 
-@pytest.mark.parametrize("variant", ["paper", "sectors", "no lidar"])
+@pytest.mark.parametrize("variant", ["paper", "sectors"])
 def test_sb3_check_env_on_a_flattened_env_without_a_warning(variant):
     sb3 = pytest.importorskip("stable_baselines3.common.env_checker")
-    if variant == "no lidar":
-        pytest.skip("nothing to observe, nothing to train on")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         sb3.check_env(FlattenObservation(ShepherdingEnv(**VARIANTS[variant])))
@@ -148,10 +146,33 @@ def test_terminates_on_success_after_five_seconds_if_asked():
         _, _, terminated, truncated, info = env.step(np.zeros((2, 2)))
         assert info["is_success"]
         ends.append((terminated, truncated))
-    assert len(ends) == 25  # 5 s of 0.2 s
+    assert len(ends) == 26  # the first reading follows the first step, the last is 5 s of 0.2 s later
     assert ends[-1] == (True, False)
     env = delivered(one)
     assert not any(env.step(np.zeros((2, 2)))[2] for _ in range(40))
+
+
+def test_five_seconds_are_five_seconds_from_the_reading_that_first_saw_it():
+    env = ShepherdingEnv("small", rewards={}, lidar=None)
+    env.reset(seed=0)
+    readings = [
+        (1.0, False),
+        (1.2, True),
+        (6.0, True),
+        (6.2, True),
+        (6.4, False),
+        (6.6, True),
+        (11.4, True),
+        (11.6, True),
+    ]
+    assert [env._held(env.state.but(time=time), success) for time, success in readings] == [
+        *(False, False, False, True),
+        *(False, False, False, True),
+    ]
+    coarse = SCENARIOS["small"].but(control_dt=10.5, terminate_on_success=True)
+    env = ShepherdingEnv(coarse, rewards={}, lidar=None)
+    env.reset(seed=0)
+    assert not env.step(np.zeros((2, 2)))[2]
 
 
 def test_the_stack_is_filled_by_the_first_frame_and_then_moves():
@@ -253,6 +274,49 @@ def test_bad_actions_and_options_are_one_clear_error_and_nothing_moves():
     assert env.state is before
     with pytest.raises(SettingsError, match="options: none are known"):
         env.reset(options={"wind": 3})
+
+
+def test_terms_that_give_nonsense_are_named():
+    class Shares:
+        def __init__(self, answer):
+            self.answer = answer
+
+        def shares(self, before, after, scan, scenario):
+            return self.answer
+
+        def __call__(self, before, after, scan, scenario):
+            return 0.0
+
+    cases = [
+        (lambda *_: math.nan, r"rewards\['odd'\]: the term gave nan, which is not finite"),
+        (lambda *_: None, r"rewards\['odd'\]: the term must give a number \(given: None"),
+        (Shares([1.0]), r"rewards\['odd'\].shares: needs shape \(2,\)"),
+        (Shares([1.0, math.inf]), r"rewards\['odd'\]: the term gave inf"),
+    ]
+    for term, message in cases:
+        env = ShepherdingEnv("small", rewards={"odd": (1.0, term)}, lidar=None)
+        env.reset(seed=0)
+        with pytest.raises(ValueError, match=message):
+            env.step(np.zeros((2, 2)))
+
+
+def test_a_term_may_want_the_scan_of_wild_sheep_alone():
+    class Seen:
+        scans = ("wild",)
+
+        def __call__(self, before, after, scan, scenario):
+            return float(np.isfinite(scan["wild"]).sum())
+
+    env = ShepherdingEnv("small", rewards={"seen": (1.0, Seen())}, lidar=None)
+    env.reset(seed=0)
+    assert env.step(np.zeros((2, 2)))[1] > 0
+
+
+def test_a_flock_that_fears_nothing_can_be_drawn():
+    flock = SCENARIOS["small"].flock.but(detection_radius=0.0)
+    env = ShepherdingEnv(SCENARIOS["small"].but(flock=flock), render_mode="rgb_array", render_size=(80, 60))
+    env.reset(seed=0)
+    assert env.render().shape == (60, 80, 3)
 
 
 def test_no_shepherds_at_all():

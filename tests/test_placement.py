@@ -133,7 +133,9 @@ def in_a_box(pos, radius):
 
 
 def test_too_little_room_is_an_error_that_says_so():
-    with pytest.raises(PlacementError, match=r"of 40 bodies still overlap after 25 sweeps: n_sheep, flock_sd"):
+    with pytest.raises(
+        PlacementError, match=r"of 40 bodies still overlap another or an obstacle after 25 sweeps: n_sheep, flock_sd"
+    ):
         relax(np.random.default_rng(5).standard_normal((40, 2)), np.full(40, 0.3), push_out=in_a_box, max_sweeps=25)
     assert issubclass(PlacementError, SettingsError)
 

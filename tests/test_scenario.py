@@ -211,7 +211,7 @@ def _with_circle(mass=1.0, moment=math.inf, radius=0.3, kind=pymunk.Body.DYNAMIC
         (_body(_with_circle(kind=pymunk.Body.STATIC)), "must be dynamic"),
         (_body(lambda self: (pymunk.Body(1, 1), [])), "at least one shape"),
         (_body(lambda self: (pymunk.Body(1, 1), [pymunk.Circle(pymunk.Body(1, 1), 1)])), "another body"),
-        (_body(_with_circle(), max_speed=math.nan), "max_speed: must be finite and above 0"),
+        (_body(_with_circle(), max_speed=math.nan), "max_speed: must be a finite number above 0"),
         (object(), "a body needs 'build'"),
     ],
 )

@@ -332,7 +332,145 @@ def test_obstacles_that_cover_the_box_are_one_clear_error():
             World(scenario).reset(0)
 
 
+def test_no_body_is_left_in_an_obstacle_and_no_room_is_an_error():
+    wedge = (Wall((-50, -0.2), (50, -0.2)), Wall((-50, 0.2), (50, 0.2)))  # 0.3 m between them, a shepherd needs 0.5
+    scenario = Scenario(n_sheep=1, n_flocks=1, shepherds=1, goal_pos=(0.0, 30.0), box=0.1, obstacles=wedge)
+    with pytest.raises(SettingsError, match="1 of 2 bodies still overlap another or an obstacle|left no room"):
+        World(scenario).reset(0)
+    corners = tuple(
+        wall
+        for x in range(-24, 25, 4)
+        for y in range(-24, 25, 4)
+        for wall in (Wall((x, y), (x + 0.8, y)), Wall((x, y), (x, y + 0.8)))
+    )
+    world = World(Scenario(n_sheep=60, n_flocks=2, goal_radius=1.0, obstacles=corners))
+    for seed in range(6):
+        state = world.reset(seed)
+        place = np.concatenate([state.sheep_pos, state.shepherd_pos])
+        radius = np.concatenate([state.sheep_radius, state.shepherd_radius])
+        body = world.space.static_body
+        gaps = [
+            min(shape.point_query(tuple(p)).distance for shape in body.shapes) - r
+            for p, r in zip(place, radius, strict=True)
+        ]
+        assert min(gaps) >= 0.0
+
+
 # ----------------------------------------------------------------------- guards
+
+
+def test_a_refused_action_changes_nothing_of_the_episode():
+    states = []
+    for refused in (False, True):
+        world = World(SMALL)
+        world.reset(4)
+        if refused:
+            for bad in (np.full((2, 2), np.nan), np.zeros(3), "left"):
+                with pytest.raises(ValueError, match="action"):
+                    world.step(bad)
+        for _ in range(20):
+            states.append(world.step(np.ones((2, 2)) * 0.3))
+    assert states[19].sheep_pos.tobytes() == states[39].sheep_pos.tobytes()
+
+
+def test_a_reset_that_fails_leaves_no_world_to_step():
+    world = World(SMALL)
+    state = world.reset(0)
+    for fail in (lambda: world.reset(-1), lambda: world.reset(None)):
+        with pytest.raises(ValueError, match="seed: needs a whole number"):
+            fail()
+        with pytest.raises(RuntimeError, match="call reset first"):
+            world.step(np.zeros((2, 2)))
+    world.reset(0)
+    with pytest.raises(ValueError, match=r"state.sheep_heading: needs shape \(20, 2\)"):
+        world.reset_to(state.but(sheep_heading=np.zeros((3, 2))), 0)
+    with pytest.raises(ValueError, match=r"state.goal_pos: every number"):
+        world.reset_to(state.but(goal_pos=[math.nan, 0.0]), 0)
+
+
+def test_huge_wishes_are_clipped_and_never_reach_the_engine():
+    world = lone(wanted=[[1e308, -1e308]])
+    put(world, [[0, 0]], [[20, 0]])
+    state = world.step([[0.0, 0.0]])
+    assert np.hypot(*state.sheep_vel[0]) == pytest.approx(30.0 * 0.2)
+
+
+@pytest.mark.parametrize("answer", [None, "fast", [[1.0, 2.0]], {"a": 1}])
+def test_flock_models_that_answer_something_else_are_named(answer):
+    world = lone()
+    put(world, [[0, 0]], [[5, 5]])
+    world.scenario.flock.wanted = answer
+    if answer == [[1.0, 2.0]]:
+        assert world.step([[0.0, 0.0]]).sheep_vel[0] == pytest.approx([1.0, 2.0])  # a list will do
+    else:
+        with pytest.raises(ValueError, match=r"flock model \(Fixed\): velocities"):
+            world.step([[0.0, 0.0]])
+
+
+@pytest.mark.parametrize("answer", [None, (1.0, 2.0, 3.0), ((1.0,), 0.0), ((1.0, "x"), 0.0)])
+def test_bodies_that_follow_with_something_else_are_named(answer):
+    @dataclasses.dataclass(frozen=True)
+    class Odd:
+        max_speed: float = 1.0
+
+        def build(self):
+            return Disc().build()
+
+        def follow(self, pose, wanted, dt):
+            return answer
+
+    world = lone(shepherds=(Odd(),))
+    put(world, [[0, 0]], [[5, 5]])
+    with pytest.raises(ValueError, match="Odd.follow: needs a velocity"):
+        world.step([[0.0, 0.0]])
+
+
+@pytest.mark.parametrize("answer", [None, pymunk.Body(1, 1), (1, 2), (pymunk.Body(1, 1), ["shape"])])
+def test_bodies_that_build_something_else_are_named(answer):
+    @dataclasses.dataclass(frozen=True)
+    class Odd:
+        max_speed: float = 1.0
+
+        def build(self):
+            return answer
+
+        def follow(self, pose, wanted, dt):
+            return wanted, 0.0
+
+    with pytest.raises(SettingsError, match="Odd.*build: needs a pymunk.Body and a list"):
+        lone(shepherds=(Odd(),)).reset(0)
+
+
+def test_obstacles_that_give_something_else_or_too_thin_shapes_are_named():
+    class Odd:
+        def __init__(self, make):
+            self.shapes = make
+
+    for make in (lambda b: None, lambda b: pymunk.Circle(b, 1.0), lambda b: ["wall"]):
+        with pytest.raises(SettingsError, match=r"obstacles\[0\] .*Odd.*shapes: needs a list of pymunk shapes"):
+            lone(obstacles=(Odd(make),)).reset(0)
+    for make in (lambda b: [pymunk.Segment(b, (9, 0), (9, 1), 0.0)], lambda b: [pymunk.Circle(b, -1.0)]):
+        with pytest.raises(SettingsError, match="must be at least 0.1 m thick"):
+            lone(obstacles=(Odd(make),)).reset(0)
+
+
+def test_a_class_in_place_of_an_object_is_named():
+    with pytest.raises(SettingsError, match=r"Disc: a class was given; make one of it: Disc\(\)"):
+        lone(shepherds=(Disc,))
+
+
+def test_sliding_along_an_obstacle_of_two_shapes_is_one_collision():
+    @dataclasses.dataclass(frozen=True)
+    class Pair:
+        def shapes(self, body):
+            return [pymunk.Segment(body, (2, -5), (2, 0), 0.05), pymunk.Segment(body, (2, 0), (2, 5), 0.05)]
+
+    world = lone(obstacles=(Pair(),))
+    put(world, [[0, 40]], [[1.6, -3.0]])
+    for _ in range(25):
+        state = world.step([[0.4, 0.9]])
+    assert state.shepherd_pos[0, 1] > 2.0
+    assert state.collisions == 1
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
@@ -349,10 +487,10 @@ def test_actions_that_are_not_finite_move_nothing(bad):
 def test_flock_models_that_want_nonsense_are_named():
     world = lone(wanted=[[math.nan, 0.0]])
     put(world, [[0, 0]], [[5, 5]])
-    with pytest.raises(NonFiniteError, match=r"velocities of the flock model \(Fixed\)"):
+    with pytest.raises(NonFiniteError, match=r"flock model \(Fixed\): velocities must be finite"):
         world.step([[0.0, 0.0]])
     world.scenario.flock.wanted = np.zeros((3, 2))
-    with pytest.raises(ValueError, match=r"flock model: velocities need shape \(1, 2\)"):
+    with pytest.raises(ValueError, match=r"flock model \(Fixed\): velocities need shape \(1, 2\)"):
         world.step([[0.0, 0.0]])
 
 
@@ -369,7 +507,7 @@ def test_bodies_that_follow_with_nonsense_are_named():
 
     world = lone(shepherds=(Broken(),))
     put(world, [[0, 0]], [[5, 5]])
-    with pytest.raises(NonFiniteError, match=r"Broken.follow: velocity .* must be finite"):
+    with pytest.raises(NonFiniteError, match=r"Broken.follow: velocity and spin must be finite"):
         world.step([[0.0, 0.0]])
 
 
@@ -391,7 +529,7 @@ def test_reset_to_refuses_states_of_other_sizes_or_with_nan():
     state = world.reset(0)
     with pytest.raises(ValueError, match="needs 20 sheep and 2 shepherds"):
         world.reset_to(World(SCENARIOS["paper"]).reset(0), 0)
-    with pytest.raises(NonFiniteError, match="every position"):
+    with pytest.raises(NonFiniteError, match="state.sheep_pos: every number"):
         world.reset_to(state.but(sheep_pos=np.full((20, 2), np.nan)), 0)
 
 
