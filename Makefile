@@ -7,8 +7,6 @@ WORKERS ?= 2
 
 # what the caller's own Python set-up must not change
 unexport PYTHONPATH PYTHONHOME PYTHONSTARTUP VIRTUAL_ENV PIP_USER PIP_TARGET PIP_PREFIX
-# the folder shepherd_phys/ of the checkout must not hide the installed package, which also holds envs, controllers, scripts
-export PYTHONSAFEPATH := 1
 
 .DELETE_ON_ERROR:
 .PHONY: help run test test-slow lint format benchmark lock clean clean-kernels .venv FORCE

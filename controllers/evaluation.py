@@ -9,12 +9,10 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from shepherd_phys.scenario import SUCCESS_FRACTION
 from shepherd_phys.state import WorldState
 
 from .base import Controller
-
-SUCCESS_FRACTION = 0.95
-"""A flock counts as delivered with this fraction of the sheep in the goal."""
 
 LABELS = ("controller", "n_flocks", "cohesion", "n_shepherds", "n_sheep", "scenario")
 """Columns that say what was run: together they name a point of an experiment."""
@@ -61,11 +59,12 @@ class Env(Protocol):
 
 
 def trial_seed(root: int, trial: int) -> int:
-    """The seed of trial ``trial`` (0-based) of a campaign with root seed ``root``, in [0, 2^32).
+    """The seed of trial ``trial`` (0-based) of a campaign with root seed ``root``, in [0, 2^63).
 
-    It depends on these two alone, so every controller and every point meets the same episodes.
+    It depends on these two alone, so every controller and every point meets the same episodes. The range is the largest
+    that SQLite's whole numbers hold: seeds of a million trials are all different.
     """
-    return int(np.random.SeedSequence([root, trial]).generate_state(1)[0])
+    return int(np.random.SeedSequence([root, trial]).generate_state(1, np.uint64)[0]) >> 1
 
 
 def run_episode(controller: Controller, env: Env, seed: int) -> dict[str, Any]:

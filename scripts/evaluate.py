@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TextIO
 
 import numpy as np
 import tyro
@@ -72,9 +72,9 @@ class Evaluate:
     scenario: Annotated[str, _flag("NAME|FILE")] = "paper"
     """A preset's name or a TOML file."""
     body: Annotated[str | None, _flag("NAME|module:Name", "the scenario's")] = None
-    """Body of every shepherd."""
+    """Body of every shepherd; those that the file describes as such keep their parameters."""
     flock: Annotated[str | None, _flag("NAME|module:Name", "the scenario's")] = None
-    """Flock model."""
+    """Flock model; if the file describes such a one, with its parameters."""
     trials: Annotated[int, _flag("T")] = 100
     """Episodes a point."""
     seed: Annotated[int, _flag("S")] = 20_000
@@ -97,52 +97,74 @@ GRID_KEYS = ("controllers", "flocks", "cohesion", "shepherds", "sheep", "scenari
 LISTS = {"controllers": str, "flocks": int, "cohesion": int, "shepherds": int}
 WANTED = dict.fromkeys(("flocks", "cohesion", "shepherds"), "whole numbers")
 WANTED |= dict.fromkeys(("sheep", "trials", "seed", "workers"), "a whole number") | {"timeout": "a number of seconds"}
-LEAST = {"flocks": 1, "cohesion": 1, "shepherds": 1, "sheep": 1, "trials": 1, "seed": 0, "workers": 1}
+LEAST = {"flocks": 1, "cohesion": 1, "shepherds": 0, "sheep": 1, "trials": 1, "seed": 0, "workers": 1}
 
 
 def main(argv: Sequence[str]) -> int:
     """Run the command; the exit status: 0, 1 if episodes failed, 2 for a mistake of the user, 130 for Ctrl-C."""
     try:
         options = read_options(argv)
+    except SettingsError as error:
+        return _fail(error, 2)
+    out = sys.stdout
+    with contextlib.redirect_stdout(sys.stderr):  # a user's classes may print wherever they are touched
+        return _main(options, out)
+
+
+def _main(options: Evaluate, out: TextIO) -> int:
+    try:
         part, count = read_shard(options.shard)
         grid = points(**{name: getattr(options, name) for name in GRID_KEYS if name not in ("trials", "seed")})
-        seeds = list(dict.fromkeys(trial_seed(options.seed, trial) for trial in range(options.trials)))
+        seeds = [trial_seed(options.seed, trial) for trial in range(options.trials)]
         todo = campaign.shard(tasks(grid, seeds), part, count)
-        ledger = Ledger(options.out, __version__)
-    except (SettingsError, ControllerError, CampaignError) as error:
+    except (SettingsError, ControllerError) as error:
         return _fail(error, 2)
-    with ledger:
-        try:
-            return _run(options, todo, ledger)
-        except CampaignError as error:
-            return _fail(error, 1)
-        except KeyboardInterrupt:
-            return _fail(f"stopped; what was finished is kept in {ledger.path}: the same command continues", 130)
-
-
-def _run(options: Evaluate, todo: list[campaign.Task], ledger: Ledger) -> int:
     with progress_bar() as report:
-        kept = ledger.rows(task.settings_hash for task in todo)
         try:
-            rehearse([task for task in todo if task.key not in kept])
-        except SettingsError as error:
+            ledger = ready(options.out, todo)
+        except (SettingsError, CampaignError) as error:
             return _fail(error, 2)
-        outcome = campaign.run(
-            todo, episode, workers=options.workers, ledger=ledger, timeout=options.timeout, report=report
-        )
-    rows = table(todo, outcome)
-    summary, paths = write_tables(options.out, rows)
-    if todo and outcome.rows[0] is not None:
-        paths += picture(todo[0], ledger)
+        with ledger:
+            try:
+                outcome = campaign.run(
+                    todo, episode, workers=options.workers, ledger=ledger, timeout=options.timeout, report=report
+                )
+                summary, paths = write_tables(options.out, table(todo, outcome))
+                if todo and outcome.rows[0] is not None:
+                    paths += picture(todo[0], ledger)
+            except CampaignError as error:
+                return _fail(error, 1)
+            except KeyboardInterrupt:
+                return _fail(f"stopped; what was finished is kept in {ledger.path}: the same command continues", 130)
     if options.json:
-        print(json.dumps(summary, allow_nan=False, indent=1))
+        print(json.dumps(summary, allow_nan=False, indent=1), file=out)
     else:
-        print_table(summary)
+        print_table(summary, out)
     for path in paths:
-        print(path, file=sys.stderr if options.json else sys.stdout)
+        print(path, file=sys.stderr if options.json else out)
     for failure in outcome.failures:
         print(f"{PROG}: no result in {failure.attempts} attempts: {failure}", file=sys.stderr)
     return 1 if outcome.failures else 0
+
+
+def ready(folder: Path, todo: Sequence[campaign.Task]) -> Ledger:
+    """The folder's ledger, when what it does not hold yet has been rehearsed.
+
+    Raises:
+        SettingsError: no world can be placed for a point. No folder has been made then.
+        CampaignError: the folder is not to be had.
+    """
+    if not (folder / campaign.LEDGER).exists():
+        rehearse(todo)
+        return Ledger(folder, __version__)
+    ledger = Ledger(folder, __version__)
+    try:
+        kept = ledger.rows(task.settings_hash for task in todo)
+        rehearse([task for task in todo if task.key not in kept])
+    except BaseException:
+        ledger.close()
+        raise
+    return ledger
 
 
 def rehearse(todo: Sequence[campaign.Task]) -> None:
@@ -256,8 +278,8 @@ def _one_line(box: str) -> str:
     return " ".join(" ".join(message).split())
 
 
-def print_table(summary: Sequence[Mapping[str, Any]]) -> None:
-    """Print what matters most of the summary on standard output; what is the same in all rows stands above it."""
+def print_table(summary: Sequence[Mapping[str, Any]], out: TextIO) -> None:
+    """Print what matters most of the summary; what is the same in all rows stands above it."""
     metrics = {
         "in_goal_end": ("in at the end %", ".1f"),
         "path_length": ("path m", ".0f"),
@@ -284,7 +306,7 @@ def print_table(summary: Sequence[Mapping[str, Any]]) -> None:
                 for n, (_, f) in metrics.items()
             ),
         )
-    console = Console(file=sys.stdout, markup=False, highlight=False)
+    console = Console(file=out, markup=False, highlight=False)
     if not console.is_terminal:
         console.width = 200  # a file has no edge to wrap at
     console.print(grid)
@@ -365,9 +387,8 @@ def draw_episode(point: Point, seed: int, path: Path) -> None:
         trail_steps=point.scenario.n_steps,
     )
     env = make_env(rewards={}, lidar=controller.lidar)
-    with contextlib.redirect_stdout(sys.stderr):
-        run_episode(controller, env, seed)
-        drawn = env.render()
+    run_episode(controller, env, seed)
+    drawn = env.render()
     env.close()
     if drawn is not None:
         save_png(drawn, path)

@@ -13,14 +13,13 @@ import itertools
 import os
 import sys
 from collections.abc import Iterable, Sequence
-from contextlib import redirect_stdout
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from shepherd_phys import __version__
-from shepherd_phys.bodies import BODIES, Body
+from shepherd_phys.bodies import BODIES, Body, Disc
 from shepherd_phys.campaign import Outcome, Task, settings_hash, write_csv
 from shepherd_phys.controllers import CONTROLLERS, Controller
 from shepherd_phys.controllers.evaluation import (
@@ -81,6 +80,8 @@ class Point:
                     "version": __version__,
                 }
             )
+        except SettingsError:
+            raise
         except (TypeError, ValueError) as error:
             raise SettingsError(f"{self}: parameters must be plain data and finite ({error})") from None
 
@@ -105,8 +106,9 @@ def points(
         cohesion: n, neighbours in the flock model's cohesion.
         shepherds: numbers of shepherds.
         sheep: N.
-        body: of all shepherds, a name of `BODIES` or ``module:Name``.
-        flock: how sheep move, a name of `FLOCKS` or ``module:Name``.
+        body: of all shepherds, a name of `BODIES` or ``module:Name``. Those that a file describes as such a body keep
+            their parameters; others become one made without arguments.
+        flock: how sheep move, a name of `FLOCKS` or ``module:Name``; its parameters as for ``body``.
 
     Raises:
         SettingsError: something is unknown or impossible; the message names it.
@@ -114,17 +116,19 @@ def points(
     """
     for name in controllers:
         find_controller(name)
-    body_class = None if body is None else find_class(body, BODIES, Body, "body")
-    flock_class = None if flock is None else find_class(flock, FLOCKS, FlockModel, "flock")
+    body_class = None if body is None else find_class(body, BODIES, "body")
+    flock_class = None if flock is None else find_class(flock, FLOCKS, "flock")
     classes = [cls for cls in (body_class, flock_class) if cls is not None]
     base = load_scenario(scenario, classes)
     if sheep is not None:
         # with the number of flocks, which is checked against it
         base = base.but(n_sheep=sheep, n_flocks=min(base.n_flocks, sheep) if flocks else base.n_flocks)
-    if flock_class is not None:
-        base = base.but(flock=_made(flock_class, "flock"))
-    if body_class is not None:
-        base = base.but(shepherds=(_made(body_class, "body"),) * base.n_shepherds)
+    if flock_class is not None and type(base.flock) is not flock_class:
+        base = base.but(flock=_made(flock_class, FlockModel, f"flock: {flock}"))
+    default: Any = Disc()
+    if body_class is not None and (not base.shepherds or any(type(own) is not body_class for own in base.shepherds)):
+        default = _made(body_class, Body, f"body: {body}")
+        base = base.but(shepherds=tuple(own if type(own) is body_class else default for own in base.shepherds))
     shown = Path(scenario).name
     found = []
     lists = [dict.fromkeys(values) or [None] for values in (flocks, cohesion, shepherds)]  # nothing twice
@@ -135,7 +139,7 @@ def points(
         if n_neighbours is not None:
             changes["flock"] = _with_neighbours(base.flock, n_neighbours)
         if n_shepherds is not None:
-            changes["shepherds"] = _team(base, n_shepherds)
+            changes["shepherds"] = _team(base, n_shepherds, default)
         found.append(Point(name, shown, base.but(**changes)))
     return found
 
@@ -217,11 +221,11 @@ def find_controller(name: str) -> Controller:
     return CONTROLLERS[name]()
 
 
-def find_class(name: str, known: dict[str, type[Any]], protocol: type[Any], where: str) -> type[Any]:
+def find_class(name: str, known: dict[str, type[Any]], where: str) -> type[Any]:
     """A class by its name among ``known`` or by ``module:Name``.
 
     Raises:
-        SettingsError: there is none, or it lacks something that ``protocol`` asks for.
+        SettingsError: there is none.
     """
     if ":" not in name:
         if name not in known:
@@ -232,10 +236,6 @@ def find_class(name: str, known: dict[str, type[Any]], protocol: type[Any], wher
     own = imported(name, where)
     if not inspect.isclass(own):
         raise SettingsError(f"{where}: {name}: needs a class (it is a {type(own).__name__})")
-    made = _made(own, where)
-    lacking = [member for member in vars(protocol) if not member.startswith("_") and not hasattr(made, member)]
-    if lacking:
-        raise SettingsError(f"{where}: {name}: lacks {', '.join(lacking)}")
     return own
 
 
@@ -249,8 +249,7 @@ def imported(name: str, where: str) -> Any:
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # at the end: it must not hide an installed package, ours in a checkout included
     try:
-        with redirect_stdout(sys.stderr):  # standard output may be for JSON
-            module = importlib.import_module(module_name)
+        module = importlib.import_module(module_name)
     except Exception as error:
         raise SettingsError(f"{where}: {name}: module {module_name!r} cannot be imported: {explain(error)}") from None
     if not hasattr(module, attribute):
@@ -267,11 +266,22 @@ def source_hash(thing: Any) -> str | None:
         return None
 
 
-def _made(cls: type[Any], where: str) -> Any:
+def _made(cls: type[Any], protocol: type[Any], where: str) -> Any:
+    """An object of the class.
+
+    Raises:
+        SettingsError: it cannot be made without arguments, or lacks something that ``protocol`` asks for.
+    """
     try:
-        return cls()
+        made = cls()
     except TypeError as error:
-        raise SettingsError(f"{where}: {cls.__name__}: cannot be made without arguments ({error})") from None
+        raise SettingsError(
+            f"{where}: cannot be made without arguments ({error}); a scenario file can give them"
+        ) from None
+    lacking = [member for member in vars(protocol) if not member.startswith("_") and not hasattr(made, member)]
+    if lacking:
+        raise SettingsError(f"{where}: lacks {', '.join(lacking)}")
+    return made
 
 
 def _with_neighbours(flock: Any, n: int) -> Any:
@@ -282,13 +292,13 @@ def _with_neighbours(flock: Any, n: int) -> Any:
     return dataclasses.replace(flock, n_neighbours=n)
 
 
-def _team(scenario: Scenario, n: int) -> tuple[Any, ...] | int:
-    """``n`` shepherds of the kind that the scenario has."""
+def _team(scenario: Scenario, n: int, default: Any) -> tuple[Any, ...]:
+    """``n`` shepherds of the kind that the scenario has, ``default`` where it has none."""
     bodies = scenario.shepherds
     scenario.but(shepherds=n)  # refuses an impossible number
-    if any(body != bodies[0] for body in bodies):
+    if n and any(body != bodies[0] for body in bodies):
         raise SettingsError(f"shepherds: the scenario's bodies differ, so {n} of them says too little; give a body")
-    return bodies[:1] * n if bodies else n
+    return (bodies[:1] or (default,)) * n
 
 
 def _sortable(value: Any) -> tuple[int, Any]:

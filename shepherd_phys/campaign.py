@@ -337,11 +337,12 @@ def write_csv(path: str | Path, columns: Sequence[str], rows: Iterable[Mapping[s
             os.fsync(file.fileno())  # the name must never stand for a file that is not on the disk yet
         os.replace(part, path)
     except OSError as error:
-        with suppress(OSError):
-            part.unlink()
         raise CampaignError(
             f"{path}: cannot be written ({error.strerror}); no episode is lost: the same run writes it again"
         ) from None
+    finally:
+        with suppress(OSError):
+            part.unlink()
 
 
 def _cell(value: Any) -> str:

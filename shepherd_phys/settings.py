@@ -10,6 +10,7 @@ import dataclasses
 import inspect
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self, TypeVar, cast, dataclass_transform
 
@@ -118,8 +119,9 @@ class Foreign:
     def missing(self) -> SettingsError:
         """The error to raise where the object itself is needed."""
         return SettingsError(
-            f"{self.kind!r} is a class of somebody's own and was not handed over: "
-            "pass it in (classes= in Python, module:Name on the command line)"
+            f"{self.kind!r} is a class of somebody's own and was not handed over: in Python, give it with classes=; "
+            "on the command line, --body module:Name hands over a body and --flock module:Name a flock model, "
+            "nothing hands over an obstacle"
         )
 
 
@@ -141,17 +143,46 @@ def _plain(value: Any) -> Any:
         return value
     if isinstance(value, tuple | list):
         return [_plain(item) for item in value]
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    if hasattr(value, "tolist"):  # numbers and arrays of NumPy
+        return _plain(value.tolist())
     return tagged(value)
 
 
 def tagged(value: Any) -> dict[str, Any]:
-    """An object as a table that also says of which kind it is."""
+    """An object as a table that also says of which kind it is.
+
+    Raises:
+        SettingsError: it has parameters, or what may be some, and does not tell which.
+    """
+    kind = kind_of(value)
     if isinstance(value, Settings | Foreign):
-        return {"kind": kind_of(value), **value.to_dict()}
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {"kind": kind, **value.to_dict()}
+    if inspect.isclass(value) or inspect.isroutine(value):
+        return {"kind": kind}
+    if callable(getattr(value, "to_dict", None)):
+        fields = dict(value.to_dict())
+    elif dataclasses.is_dataclass(value):
         fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
-        return {"kind": kind_of(value), **{k: _plain(v) for k, v in fields.items() if v is not None}}
-    return {"kind": kind_of(value)}
+    elif kind.startswith("builtins:") or _has_state(value):
+        raise SettingsError(
+            f"{kind}: cannot be written, because it does not say what its parameters are: "
+            "make the class a dataclass, or give it to_dict() with the arguments that make an equal object"
+        )
+    else:
+        fields = {}
+    if "kind" in fields:
+        raise SettingsError(f"{kind}.kind: a parameter needs another name: in a file, kind is the class's")
+    return {"kind": kind, **{name: _plain(item) for name, item in fields.items() if item is not None}}
+
+
+def _has_state(value: object) -> bool:
+    """Whether two objects of its class may differ, as far as Python can see."""
+    try:
+        return object.__getstate__(value) is not None
+    except TypeError:
+        return True
 
 
 def untagged(table: Mapping[str, Any], known: Mapping[str, Callable[..., Any]], where: str) -> Any:
@@ -178,7 +209,9 @@ def untagged(table: Mapping[str, Any], known: Mapping[str, Callable[..., Any]], 
             return made
         try:
             return made(**values)
-        except TypeError as error:
+        except SettingsError:
+            raise
+        except (TypeError, ValueError) as error:
             raise SettingsError(f"{where}: {kind}: {error}") from None
     if ":" in kind:
         return Foreign(kind, values)
@@ -191,11 +224,25 @@ def handed_over(classes: Iterable[Any]) -> dict[str, Any]:
 
 
 def write_toml(table: Mapping[str, Any], path: str | Path) -> None:
-    """Write plain data as TOML; the file appears whole or not at all."""
+    """Write plain data as TOML; the file appears whole or not at all.
+
+    Raises:
+        SettingsError: it cannot be written; the message names it.
+    """
     path = Path(path)
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_bytes(tomli_w.dumps(table).encode())
-    temporary.replace(path)
+    try:
+        text = tomli_w.dumps(table)
+        temporary = path.with_name(path.name + ".part")
+        try:
+            temporary.write_bytes(text.encode())
+            temporary.replace(path)
+        finally:
+            with suppress(OSError):
+                temporary.unlink()
+    except OSError as error:
+        raise SettingsError(f"{path}: cannot be written ({error.strerror})") from None
+    except (TypeError, ValueError) as error:
+        raise SettingsError(f"{path}: cannot be written ({error})") from None
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:

@@ -353,6 +353,19 @@ def test_a_table_that_cannot_be_written_leaves_the_old_one(tmp_path, monkeypatch
     assert contents(tmp_path) == {"t.csv": b"a\n1\n"}
 
 
+def test_a_table_that_lacks_a_column_leaves_nothing_behind(tmp_path):
+    with pytest.raises(KeyError):
+        write_csv(tmp_path / "t.csv", ["a"], [{"a": 1}, {}])
+    assert contents(tmp_path) == {}
+
+
+def test_seeds_of_63_bits_have_a_place_in_the_ledger(tmp_path):
+    task = Task("h", 2**63 - 1, "")
+    with Ledger(tmp_path, "1") as ledger:
+        ledger.add(task, "{}")
+        assert ledger.rows(["h"]) == {task.key: {}}
+
+
 # ---- plain functions ----------------------------------------------------------------------------------------------
 
 

@@ -15,7 +15,7 @@ from shepherd_phys.bodies import Disc, built
 from shepherd_phys.flock import Strombom
 from shepherd_phys.obstacles import Pillar, Polygon, Wall
 from shepherd_phys.scenario import SCENARIOS, Scenario, load_scenario
-from shepherd_phys.settings import Foreign, SettingsError
+from shepherd_phys.settings import Foreign, SettingsError, write_toml
 from shepherd_phys.world import World
 
 
@@ -239,3 +239,109 @@ def test_reach_holds_every_shape():
 
     assert built(Odd(), "it")[2] == pytest.approx(0.55)
     assert [shape.friction for shape in shapes] == [0.0] * 3
+
+
+# ------------------------------------------------- a user's own, to a file and back
+
+
+class Silent:
+    """A flock model that keeps its parameter to itself."""
+
+    def __init__(self, pace=0.5):
+        self.pace = pace
+
+    def velocities(self, state, rng):
+        return np.full((state.n_sheep, 2), self.pace)
+
+
+class Slotted(Silent):
+    __slots__ = ("pace",)
+
+
+class Told(Silent):
+    def to_dict(self):
+        return {"pace": self.pace, "table": None}
+
+    def __init__(self, pace=0.5, table=None):
+        super().__init__(pace)
+
+
+class Stateless:
+    def velocities(self, state, rng):
+        return np.zeros((state.n_sheep, 2))
+
+
+@dataclasses.dataclass(frozen=True)
+class Rich:
+    """All that a dataclass may hold."""
+
+    count: object = np.int64(3)
+    table: object = dataclasses.field(default_factory=lambda: {"a": (1, np.float32(0.5))})
+    rows: object = dataclasses.field(default_factory=lambda: np.eye(2))
+
+
+@pytest.mark.parametrize("thing", [Silent(), Slotted(2.0)])
+def test_parameters_that_nobody_tells_are_refused_only_when_written(thing, tmp_path):
+    scenario = SCENARIOS["small"].but(flock=thing)
+    World(scenario).reset(0)
+    name = type(thing).__name__
+    with pytest.raises(SettingsError, match=rf":{name}: cannot be written.*make the class a dataclass, or give it to_"):
+        scenario.to_dict()
+    with pytest.raises(SettingsError, match=name):
+        scenario.to_toml(tmp_path / "scenario.toml")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("thing", [None, {1, 2}, 1j])
+def test_what_has_no_place_in_a_file_is_refused(thing):
+    with pytest.raises(SettingsError, match=f"builtins:{type(thing).__name__}: cannot be written"):
+        SCENARIOS["small"].but(obstacles=(Rich(table=(thing,)),)).to_dict()
+
+
+def test_a_plain_class_that_tells_its_parameters_survives_a_file(tmp_path):
+    path = tmp_path / "scenario.toml"
+    SCENARIOS["small"].but(flock=Told(0.25)).to_toml(path)
+    assert Scenario.from_toml(path, classes=[Told]).flock.pace == 0.25
+    SCENARIOS["small"].but(flock=Stateless()).to_toml(path)
+    assert isinstance(Scenario.from_toml(path, classes=[Stateless]).flock, Stateless)
+
+
+def test_numpy_and_tables_in_a_users_dataclass_are_written():
+    (table,) = SCENARIOS["small"].but(obstacles=(Rich(),)).to_dict()["obstacles"]
+    assert table.pop("kind").endswith(":Rich")
+    assert table == {"count": 3, "table": {"a": [1, 0.5]}, "rows": [[1.0, 0.0], [0.0, 1.0]]}
+
+
+def test_a_parameter_cannot_be_called_kind():
+    @dataclasses.dataclass(frozen=True)
+    class Rock:
+        kind: str = "granite"
+
+    with pytest.raises(SettingsError, match=r"Rock\.kind: a parameter needs another name"):
+        SCENARIOS["small"].but(obstacles=(Rock(),)).to_dict()
+
+
+def test_a_users_class_that_refuses_its_values_is_named():
+    @dataclasses.dataclass(frozen=True)
+    class Rock:
+        size: float
+
+        def __post_init__(self):
+            raise ValueError("too small")
+
+    kind = f"{Rock.__module__}:{Rock.__qualname__}"
+    with pytest.raises(SettingsError, match=r"^Scenario.obstacles\[0\]: .*Rock: too small$"):
+        Scenario.from_dict({"obstacles": [{"kind": kind, "size": 1.0}]}, classes=[Rock])
+
+
+def test_a_file_that_cannot_be_written_is_named_and_leaves_nothing(tmp_path):
+    lost = tmp_path / "nowhere" / "scenario.toml"
+    with pytest.raises(SettingsError, match=re.escape(f"{lost}: cannot be written (No such file or directory)")):
+        SCENARIOS["small"].to_toml(lost)
+    taken = tmp_path / "taken.toml"
+    taken.mkdir()
+    with pytest.raises(SettingsError, match="taken.toml: cannot be written"):
+        SCENARIOS["small"].to_toml(taken)
+    with pytest.raises(SettingsError, match="t.toml: cannot be written"):
+        write_toml({"a": object()}, tmp_path / "t.toml")
+    assert list(tmp_path.iterdir()) == [taken]

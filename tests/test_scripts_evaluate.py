@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import math
 import signal
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shepherd_phys import __version__, campaign
+from shepherd_phys.bodies import Disc
 from shepherd_phys.campaign import Ledger
 from shepherd_phys.controllers.evaluation import COLUMNS, METRICS, trial_seed
 from shepherd_phys.controllers.summary import summary_columns
@@ -25,10 +27,20 @@ from shepherd_phys.scripts.points import points
 from shepherd_phys.settings import SettingsError
 
 TINY = {"n_sheep": 6, "n_flocks": 2, "shepherds": 2, "n_steps": 6}
+HERD = {
+    **TINY,
+    "shepherds": [{"kind": "mine:Cart", "size": 0.3}, {"kind": "mine:Cart", "size": 0.2, "max_speed": 2.0}],
+    "flock": {"kind": "mine:Crowd", "pace": 0.25},
+}
+BOULDER = {"kind": "Wall", "start": [-90.0, 0.0], "end": [90.0, 0.0], "thickness": 180.0}
+"""No world can be placed round it."""
 COMMAND = Path(sys.executable).with_name("shepherd-phys")
 
 MINE = """
+from dataclasses import dataclass
+
 import numpy as np
+import pymunk
 from shepherd_phys.bodies import Disc
 from shepherd_phys.flock import Strombom
 
@@ -51,6 +63,41 @@ class Half:
 
 class Odd(Chase):
     def to_dict(self): return {"rng": object()}
+
+class Loud(Chase):
+    def __init__(self): print("a controller that prints when it is made")
+    def reset(self, rng): print("and when it begins")
+
+class Bell(Disc):
+    def build(self):
+        print("a body that prints when it is built")
+        return super().build()
+
+@dataclass(frozen=True)
+class Cart:
+    size: float
+    max_speed: float = 1.2
+    def __post_init__(self):
+        if self.size < 0: raise ValueError("a cart has a size")
+    def build(self):
+        body = pymunk.Body(1.0, 1.0)
+        return body, [pymunk.Circle(body, self.size)]
+    def follow(self, pose, wanted, dt): return wanted, 0.0
+
+@dataclass(frozen=True)
+class Crowd:
+    n_neighbours: int = 4
+    pace: float = 0.5
+    def velocities(self, state, rng): return np.full((state.n_sheep, 2), self.pace)
+
+@dataclass(frozen=True)
+class Post:
+    x: float = 9.0
+    def shapes(self, body): return [pymunk.Circle(body, 0.5, (self.x, 0.0))]
+
+class Moody:
+    def __init__(self): self.mood = 0.3
+    def velocities(self, state, rng): return np.zeros((state.n_sheep, 2))
 
 class Slim(Disc): pass
 class Shy(Strombom): pass
@@ -140,6 +187,18 @@ def test_json_is_all_that_there_is_on_standard_output(folder):
     assert "o/summary.csv" in done.stderr
 
 
+def test_nothing_of_a_users_gets_onto_standard_output(folder, in_process, capsys):
+    own = ["--controllers", "mine:Loud", "--body", "mine:Bell"]
+    assert run(*own, "--json") == 0
+    said = capsys.readouterr()
+    assert [row["controller"] for row in json.loads(said.out)] == ["mine:Loud"]
+    for line in ("prints when it is made", "and when it begins", "a body that prints when it is built"):
+        assert line in said.err
+    assert run(*own) == 0
+    out = capsys.readouterr().out
+    assert "in at the end %" in out and "print" not in out and "and when" not in out
+
+
 def test_tables_do_not_depend_on_workers_order_or_interruption(folder, in_process):
     assert run("--controllers", "idle", "random", "--out", "a", workers=0) == 0
     assert run("--controllers", "random", "idle", "--out", "b", workers=2) == 0
@@ -193,6 +252,38 @@ def test_a_users_own_body_and_flock(folder, in_process):
     assert {(row["controller"], row["cohesion"]) for row in read("results/episodes.csv")} == {("mine:Chase", "4")}
     assert run("--controllers", "idle", "--flock", "mine:Free") == 0
     assert {row["cohesion"] for row in read("results/episodes.csv")} == {""}
+
+
+def test_a_users_own_classes_keep_the_parameters_of_the_file(folder, in_process):
+    Path("herd.toml").write_text(tomli_w.dumps(HERD))
+    own = ["--scenario", "herd.toml", "--body", "mine:Cart", "--flock", "mine:Crowd"]
+    assert run(*own, "--controllers", "idle") == 0  # a Cart cannot even be made without arguments
+    (point,) = points(controllers=["idle"], scenario="herd.toml", body="mine:Cart", flock="mine:Crowd")
+    assert [(body.size, body.max_speed) for body in point.scenario.shepherds] == [(0.3, 1.2), (0.2, 2.0)]
+    assert (point.scenario.flock.pace, point.scenario.flock.n_neighbours) == (0.25, 4)
+    assert {row["settings_hash"] for row in read("results/episodes.csv")} == {point.settings_hash()}
+    (point,) = points(controllers=["idle"], scenario="herd.toml", body="Disc", flock="mine:Crowd", cohesion=[3])
+    assert point.scenario.shepherds == (Disc(), Disc())
+    assert (point.scenario.flock.pace, point.scenario.flock.n_neighbours) == (0.25, 3)
+
+
+def test_bodies_of_another_kind_become_the_one_asked_for(folder):
+    bodies = [{"kind": "Disc", "radius": 0.4}, {"kind": "mine:Slim", "radius": 0.3}]
+    Path("mixed.toml").write_text(tomli_w.dumps({**TINY, "shepherds": bodies}))
+    (point,) = points(controllers=["idle"], scenario="mixed.toml", body="mine:Slim")
+    assert [(type(body).__name__, body.radius) for body in point.scenario.shepherds] == [("Slim", 0.25), ("Slim", 0.3)]
+    Path("none.toml").write_text(tomli_w.dumps({**TINY, "shepherds": 0}))
+    (point,) = points(controllers=["idle"], scenario="none.toml", body="mine:Slim", shepherds=[2])
+    assert [type(body).__name__ for body in point.scenario.shepherds] == ["Slim", "Slim"]
+
+
+def test_a_world_without_shepherds(folder, in_process, capsys):
+    assert run("--controllers", "idle", "random", "strombom", "--shepherds", "0", "1", "--json") == 0
+    rows = [row for row in json.loads(capsys.readouterr().out) if row["n_shepherds"] == 0]
+    assert [row["controller"] for row in rows] == ["idle", "random", "strombom"]
+    for row in rows:
+        assert row["path_length_mean"] == row["path_length_high"] == row["collisions_mean"] == 0
+        assert all(math.isfinite(row[f"{name}_{part}"]) for name in METRICS for part in ("mean", "low", "high"))
 
 
 def test_shards_make_up_the_whole(folder, in_process):
@@ -284,12 +375,18 @@ def test_points_are_the_full_cross_product_without_repeats(lists):
 
 
 def test_a_world_that_cannot_be_placed_is_one_error(folder, in_process, capsys):
-    wall = {"kind": "Wall", "start": [-90.0, 0.0], "end": [90.0, 0.0], "thickness": 180.0}
-    Path("tiny.toml").write_text(tomli_w.dumps({**TINY, "obstacles": [wall]}))
-    assert run("--controllers", "idle") == 2
-    said = capsys.readouterr()
-    assert said.out == ""
-    assert len(mistakes(said.err)) == 1
+    assert run("--controllers", "idle") == 0  # a ledger that is there stays
+    capsys.readouterr()
+    before = Path("results/episodes.csv").read_bytes()
+    Path("tiny.toml").write_text(tomli_w.dumps({**TINY, "obstacles": [BOULDER]}))
+    for out in ("results", "deep/er"):
+        assert run("--controllers", "idle", "--out", out) == 2
+        said = capsys.readouterr()
+        assert said.out == ""
+        assert len(mistakes(said.err)) == 1
+    assert Path("results/episodes.csv").read_bytes() == before
+    assert not Path("deep").exists()
+    Ledger("results", __version__).close()  # free again
 
 
 # ---- mistakes -----------------------------------------------------------------------------------------------------
@@ -327,10 +424,16 @@ MISTAKES = [
     ("--scenario odd.toml", "Scenario.n_shep: there is no such field"),
     ("--body nobody", "body: 'nobody' is unknown; there are Disc"),
     ("--body mine:Stone", "body: mine:Stone: lacks build, follow"),
-    ("--body mine:Needy", "body: Needy: cannot be made without arguments"),
+    ("--body mine:Needy", "body: mine:Needy: cannot be made without arguments"),
     ("--body mine:number", "body: mine:number: needs a class (it is a int)"),
     ("--flock nobody", "flock: 'nobody' is unknown; there are"),
     ("--flock mine:Stone", "flock: mine:Stone: lacks velocities"),
+    ("--flock mine:Moody", "mine:Moody: cannot be written, because it does not say what its parameters are"),
+    ("--scenario herd.toml --body mine:Cart", "'mine:Crowd' is a class of somebody's own and was not handed over"),
+    ("--scenario herd.toml --flock mine:Crowd", "--body module:Name hands over a body and --flock"),
+    ("--scenario post.toml", "nothing hands over an obstacle"),
+    ("--scenario broken.toml --body mine:Cart", "Scenario.shepherds[0]: mine:Cart: a cart has a size"),
+    ("--scenario full.toml", "obstacles"),
     ("--grid nowhere.toml", "nowhere.toml: cannot be read"),
     ("--grid bad.toml", "bad.toml: is not a TOML file"),
     ("--grid odd.toml", "odd.toml: n_shep is unknown; a grid sets controllers, flocks"),
@@ -352,6 +455,10 @@ MISTAKES = [
 def test_mistakes_are_one_clear_line(folder, capsys, words, message):
     Path("bad.toml").write_text("n_sheep = = 3")
     Path("odd.toml").write_text("n_shep = 3")
+    Path("herd.toml").write_text(tomli_w.dumps(HERD))
+    Path("post.toml").write_text(tomli_w.dumps({**TINY, "obstacles": [{"kind": "mine:Post"}]}))
+    Path("broken.toml").write_text(tomli_w.dumps({**TINY, "shepherds": [{"kind": "mine:Cart", "size": -1.0}]}))
+    Path("full.toml").write_text(tomli_w.dumps({**TINY, "obstacles": [BOULDER]}))
     Path("words.toml").write_text('flocks = ["two"]')
     Path("true.toml").write_text("trials = true")
     Path("none.toml").write_text("flocks = []")
