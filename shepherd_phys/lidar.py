@@ -374,4 +374,5 @@ def turn(action: NDArray[Any], offset: NDArray[np.int64], beams: int) -> NDArray
     angle = (2.0 * np.pi / beams) * offset
     ca, sa = np.cos(angle), np.sin(angle)
     x, y = action[..., 0], action[..., 1]
-    return np.stack((ca * x - sa * y, sa * x + ca * y), axis=-1).astype(np.result_type(action.dtype, np.float32), copy=False)
+    turned = np.stack((ca * x - sa * y, sa * x + ca * y), axis=-1)
+    return turned.astype(np.result_type(action.dtype, np.float32), copy=False)
