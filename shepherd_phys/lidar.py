@@ -341,7 +341,8 @@ def observe(stack: Proximities, offset: NDArray[np.int64], lidar: Lidar) -> tupl
     Returns:
         a fresh (..., stack x channels, columns), or (..., channels x columns, 1, stack) for the layout "paper", and
         the beam offset now (...): observed column 0 points at world beam ``offset``. It stays where no goal beam is
-        lit, or more than half of them (then the shepherd stands inside).
+        lit, or more than half of them (then the shepherd stands inside; obstacles so near to the goal that they cut
+        half of the way out hide that from it).
     """
     return _observe(np.array(stack, np.float32), np.asarray(offset, np.int64), lidar)
 
