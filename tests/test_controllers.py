@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shepherd_phys.controllers import CONTROLLERS, Random, StrombomLiteral, StrombomTeam
-from shepherd_phys.controllers.strombom import StrombomSettings, round_about, team_targets, walk
+from shepherd_phys.controllers.formation import ring_places, round_about, walk
+from shepherd_phys.controllers.strombom import StrombomSettings, team_targets
 from shepherd_phys.envs import ShepherdingEnv
 from shepherd_phys.scenario import Scenario
 from shepherd_phys.settings import SettingsError
@@ -70,9 +71,7 @@ def test_walking_slows_only_to_arrive():
 
 def test_terminal_rule_rings_a_delivered_flock_evenly_beyond_its_influence():
     state = arranged([[0.5, 0], [-0.5, 0], [0, 0.5], [0, -0.5]], [[9, 1], [-9, 1], [0, -9]])
-    team = StrombomTeam()
-    team.reset(np.random.default_rng(0))
-    places = team._ring(state, 10.0)
+    places = ring_places(state, 10.0)
     assert np.linalg.norm(places, axis=1) == pytest.approx([10.0] * 3)
     bearing = np.sort(np.arctan2(places[:, 1], places[:, 0]))
     assert np.diff(bearing) == pytest.approx([2 * math.pi / 3] * 2)
