@@ -14,9 +14,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pymunk
 from numpy.typing import NDArray
 from pydantic import Field
 
+from shepherd_phys.geometry import OBSTACLES, Geometry, compile_shapes
+from shepherd_phys.obstacles import Obstacle, solid
 from shepherd_phys.settings import Settings, settings
 from shepherd_phys.state import Floats, WorldState, centroid, sub_flocks, unit
 
@@ -87,6 +90,23 @@ class Team:
         return round_about(state.shepherd_pos, targets, centroid(flocks[0]), self._common.berth)
 
 
+class Surroundings:
+    """The obstacles of an episode as surfaces, compiled once."""
+
+    def __init__(self) -> None:
+        self._obstacles: tuple[Obstacle, ...] = ()
+        self._geometry = compile_shapes(())
+
+    def of(self, obstacles: tuple[Obstacle, ...]) -> Geometry:
+        """Their surfaces."""
+        if obstacles is not self._obstacles:
+            body = pymunk.Body(body_type=pymunk.Body.STATIC)
+            shapes = [shape for i, obstacle in enumerate(obstacles) for shape in solid(obstacle, i, body)]
+            self._geometry = compile_shapes((shape, -1, OBSTACLES) for shape in shapes)
+            self._obstacles = obstacles
+        return self._geometry
+
+
 def flocks_out(state: WorldState, link: float, home: float) -> list[Floats]:
     """Positions (K, 2) of each sub-flock that is not home; first the one whose furthest sheep is nearest to the goal.
 
@@ -137,6 +157,11 @@ def beyond(targets: Floats, center: Floats, radius: float) -> Floats:
     away = targets - center
     near = np.hypot(away[:, 0], away[:, 1]) < radius
     return np.asarray(np.where(near[:, None], center + radius * unit(away), targets))
+
+
+def limited(action: Floats) -> Floats:
+    """Actions (P, 2), those longer than 1 cut to length 1."""
+    return np.asarray(action / np.maximum(np.hypot(action[:, 0], action[:, 1]), 1.0)[:, None])
 
 
 def round_about(pos: Floats, targets: Floats, center: Floats, radius: float) -> Floats:
