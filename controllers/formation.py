@@ -43,6 +43,8 @@ class TeamSettings(Settings):
     """Distance from the goal's centre at which shepherds hold a delivered flock, and nearer than which none drives."""
     ring_out: float = Field(default=11.0, gt=0)
     """The same for a team of one or two, which cannot ring the flock evenly and must not push it."""
+    loyalty: float = Field(default=4.0, ge=0)
+    """Another sub-flock is taken up before the one at work is home only if its furthest sheep is this much nearer."""
     berth: float = Field(default=9.0, ge=0)
     """Nearer than this to a flock's centroid no shepherd passes on its way to the other side."""
 
@@ -62,6 +64,7 @@ class Team:
     def reset(self, rng: np.random.Generator) -> None:
         """Take the episode's generator."""
         self._rng = rng
+        self._at: Floats | None = None  # centroid of the sub-flock last at work
 
     def to_dict(self) -> dict[str, Any]:
         """Its parameters."""
@@ -73,16 +76,33 @@ class Team:
         ring = s.ring if state.n_shepherds >= 3 else s.ring_out
         flocks = flocks_out(state, s.link, state.goal_radius + s.let_go)
         if not flocks:
-            targets = round_about(state.shepherd_pos, ring_places(state, ring), state.goal_pos, ring)
+            self._at = None
+            places = ring_places(state, ring) if state.n_shepherds >= 3 else leak_places(state, ring)
+            targets = round_about(state.shepherd_pos, places, state.goal_pos, ring)
             return walk(state, targets, 0.0, s.noise, self._rng)
+        flocks = self._kept_first(state, flocks)
+        self._at = centroid(flocks[0])
         targets = beyond(self._targets(state, flocks), state.goal_pos, ring)
         targets = self._way(state, targets, flocks)
         if state.sheep_in_goal.any():
             targets = round_about(state.shepherd_pos, targets, state.goal_pos, ring)
         return walk(state, targets, s.stop_distance, s.noise, self._rng)
 
+    def _kept_first(self, state: WorldState, flocks: list[Floats]) -> list[Floats]:
+        """The sub-flocks with the one last at work first, unless another is now much sooner done.
+
+        Without this a team between two equal flocks turns from one to the other for ever, frightening each away.
+        """
+        if self._at is None:
+            return flocks
+        kept = int(np.argmin([np.hypot(*(centroid(flock) - self._at)) for flock in flocks]))
+        reach = [float(np.hypot(*(flocks[i] - state.goal_pos).T).max()) for i in (0, kept)]
+        if reach[1] - reach[0] > self._common.loyalty:
+            return flocks
+        return [flocks[kept], *flocks[:kept], *flocks[kept + 1 :]]
+
     def _targets(self, state: WorldState, flocks: list[Floats]) -> Floats:
-        """(P, 2) where the method wants the shepherds, given the sub-flocks (K, 2) not yet home, soonest done first."""
+        """(P, 2) where the method wants the shepherds, given the sub-flocks (K, 2) not yet home, the first at work."""
         raise NotImplementedError
 
     def _way(self, state: WorldState, targets: Floats, flocks: list[Floats]) -> Floats:
@@ -135,6 +155,23 @@ def ring_places(state: WorldState, radius: float) -> Floats:
     place = np.empty(p)
     place[order] = slots + turn
     return np.asarray(state.goal_pos + radius * heading(place))
+
+
+def leak_places(state: WorldState, radius: float) -> Floats:
+    """(P, 2) places on a circle round the goal for a team too small to ring it: where sheep lean out.
+
+    The first place is behind the sheep furthest from the goal's centre, the others evenly round from there.
+    """
+    p = state.n_shepherds
+    out = state.sheep_pos - state.goal_pos
+    first = bearing_of(out[np.argmax(np.hypot(*out.T))])
+    places = state.goal_pos + radius * heading(first + 2 * np.pi * np.arange(p) / max(p, 1))
+    if (
+        p == 2
+        and np.hypot(*(places - state.shepherd_pos).T).sum() > np.hypot(*(places[::-1] - state.shepherd_pos).T).sum()
+    ):
+        places = places[::-1]
+    return np.asarray(places)
 
 
 def heading(angle: Floats) -> Floats:

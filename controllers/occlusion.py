@@ -5,7 +5,8 @@ Our reading of Hu et al. (IEEE TCDS 14(1):126-135, 2022), whose formulas are not
 * sub-flocks by single linkage; from the largest on, each gets the nearest free shepherd, the rest go to the largest;
 * for a shepherd at S and its sub-flock with centroid c and radius R_c (its furthest sheep), beta is the signed angle at
   S from c to the goal g. The goal is **occluded** when |beta| < atan(R_c / |c - S|), and lies behind the sheep;
-* occluded: go straight for the flock up to R_c + `approach` from c, and so push it;
+* occluded: go straight for the flock up to e + `approach` from c, and so push it; e is how far the flock reaches from c
+  towards the shepherd (R_c for a round one: behind a long one, R_c away, a shepherd would not be felt);
 * else circle c at R_c + `circle` in the sense that shrinks beta: with its sign, counter-clockwise being positive.
 
 R_c is never taken as less than `min_radius`: one sheep hides nothing. The team has a terminal rule
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from shepherd_phys.settings import settings
-from shepherd_phys.state import Floats, WorldState, centroid
+from shepherd_phys.state import Floats, WorldState, centroid, unit
 
 from .formation import WEDGE, Team, TeamSettings, bearing_of, heading, wrapped
 
@@ -52,9 +53,10 @@ class Occlusion(Team):
         centers = np.array([centroid(flock) for flock in flocks])
         radii = [max(float(np.hypot(*(f - c).T).max()), s.min_radius) for f, c in zip(flocks, centers, strict=True)]
         chosen = shared_out(state.shepherd_pos, centers, np.array([len(flock) for flock in flocks]))
-        return occlusion_targets(
-            state.shepherd_pos, state.goal_pos, centers[chosen], np.array(radii)[chosen], s.approach, s.circle
-        )
+        own, pos = centers[chosen], state.shepherd_pos
+        facing = unit(pos - own)
+        extents = np.array([((flocks[f] - centers[f]) @ facing[k]).max() for k, f in enumerate(chosen)])
+        return occlusion_targets(pos, state.goal_pos, own, np.array(radii)[chosen], extents + s.approach, s.circle)
 
     def _way(self, state: WorldState, targets: Floats, flocks: list[Floats]) -> Floats:
         return targets  # circling is part of the method
@@ -81,7 +83,7 @@ def shared_out(pos: Floats, centers: Floats, sizes: NDArray[np.int64]) -> NDArra
 
 
 def occlusion_targets(
-    pos: Floats, goal: Floats, centers: Floats, radii: Floats, approach: float, circle: float
+    pos: Floats, goal: Floats, centers: Floats, radii: Floats, approach: Floats, circle: float
 ) -> Floats:
     """(P, 2) where each shepherd goes: at its flock, or on round it [m].
 
@@ -90,7 +92,7 @@ def occlusion_targets(
         goal: (2,) g [m].
         centers: (P, 2) centroid c of each one's sub-flock [m].
         radii: (P,) R_c [m].
-        approach: beyond R_c, when the goal is occluded [m].
+        approach: (P,) from c, when the goal is occluded [m].
         circle: beyond R_c, when it is not [m].
     """
     to_flock, to_goal = centers - pos, goal - pos
@@ -103,7 +105,7 @@ def occlusion_targets(
         centers
         + np.where(
             occluded[:, None],
-            (radii + approach)[:, None] * heading(bearing),
+            approach[:, None] * heading(bearing),
             (radii + circle)[:, None] * heading(on),
         )
     )
