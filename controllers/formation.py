@@ -41,8 +41,10 @@ class TeamSettings(Settings):
     """A sub-flock is home when its furthest sheep is within the goal's radius plus this of the goal's centre."""
     ring: float = Field(default=10.5, gt=0)
     """Distance from the goal's centre at which shepherds hold a delivered flock, and nearer than which none drives."""
-    ring_out: float = Field(default=11.0, gt=0)
-    """The same for a team of one or two, which cannot ring the flock evenly and must not push it."""
+    ring_out: float = Field(default=12.0, gt=0)
+    """The same for a team of one or two, which stands where sheep lean out and is felt up to 2 m from the centre."""
+    crumb: float = Field(default=0.1, ge=0, le=1)
+    """A sub-flock with less than this fraction of the largest one's sheep waits until the others are home."""
     loyalty: float = Field(default=4.0, ge=0)
     """Another sub-flock is taken up before the one at work is home only if its furthest sheep is this much nearer."""
     berth: float = Field(default=9.0, ge=0)
@@ -74,7 +76,7 @@ class Team:
         """(P, 2)."""
         s = self._common
         ring = s.ring if state.n_shepherds >= 3 else s.ring_out
-        flocks = flocks_out(state, s.link, state.goal_radius + s.let_go)
+        flocks = flocks_out(state, s.link, state.goal_radius + s.let_go, s.crumb)
         if not flocks:
             self._at = None
             places = ring_places(state, ring) if state.n_shepherds >= 3 else leak_places(state, ring)
@@ -96,6 +98,8 @@ class Team:
         if self._at is None:
             return flocks
         kept = int(np.argmin([np.hypot(*(centroid(flock) - self._at)) for flock in flocks]))
+        if len(flocks[kept]) < self._common.crumb * max(map(len, flocks)):
+            return flocks
         reach = [float(np.hypot(*(flocks[i] - state.goal_pos).T).max()) for i in (0, kept)]
         if reach[1] - reach[0] > self._common.loyalty:
             return flocks
@@ -127,20 +131,27 @@ class Surroundings:
         return self._geometry
 
 
-def flocks_out(state: WorldState, link: float, home: float) -> list[Floats]:
+def flocks_out(state: WorldState, link: float, home: float, crumb: float = 0.0) -> list[Floats]:
     """Positions (K, 2) of each sub-flock that is not home; first the one whose furthest sheep is nearest to the goal.
+
+    Crumbs come after all others: a team after one sheep would frighten away the flock beside it.
 
     Args:
         state: of the world.
         link: sheep nearer than this belong together [m].
         home: a sub-flock with all sheep this near to the goal's centre is home [m].
+        crumb: a sub-flock with less than this fraction of the sheep of the largest not home is one.
     """
     out = np.hypot(*(state.sheep_pos - state.goal_pos).T)
     label = sub_flocks(state.sheep_pos, link)
     reach = np.zeros(label.max() + 1)
     np.maximum.at(reach, label, out)
-    order = np.argsort(reach, kind="stable")
-    return [np.asarray(state.sheep_pos[label == i]) for i in order if reach[i] > home]
+    wild = np.flatnonzero(reach > home)
+    if not len(wild):
+        return []
+    size = np.bincount(label)[wild]
+    order = np.lexsort((reach[wild], size < crumb * size.max()))
+    return [np.asarray(state.sheep_pos[label == i]) for i in wild[order]]
 
 
 def ring_places(state: WorldState, radius: float) -> Floats:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scenes import NOTHING, arranged
 
 from shepherd_phys.controllers import CONTROLLERS, Random, StrombomLiteral, StrombomTeam
 from shepherd_phys.controllers.formation import ring_places, round_about, walk
@@ -16,17 +17,7 @@ from shepherd_phys.settings import SettingsError
 from shepherd_phys.state import sub_flocks
 from shepherd_phys.world import World
 
-NOTHING = np.empty(0, dtype=np.float32)
 BASE = {n: World(Scenario(n_sheep=n, n_flocks=1, shepherds=3, goal_pos=(0.0, 0.0))).reset(0) for n in (1, 4, 10)}
-
-
-def arranged(sheep, shepherds, goal=(0.0, 0.0)):
-    sheep, shepherds = np.array(sheep, float), np.array(shepherds, float)
-    template = World(Scenario(n_sheep=len(sheep), n_flocks=1, shepherds=len(shepherds))).reset(0)
-    away = np.linalg.norm(sheep - goal, axis=1)
-    return template.but(
-        sheep_pos=sheep, shepherd_pos=shepherds, goal_pos=goal, sheep_in_goal=away <= 2.5, sheep_arrived=away <= 2.5
-    )
 
 
 def test_driving_in_a_v_behind_the_centroid():
