@@ -43,7 +43,7 @@ class TeamSettings(Settings):
     """Distance from the goal's centre at which shepherds hold a delivered flock, and nearer than which none drives."""
     ring_out: float = Field(default=12.0, gt=0)
     """The same for a team of one or two, which stands where sheep lean out and is felt up to 2 m from the centre."""
-    crumb: float = Field(default=0.1, ge=0, le=1)
+    crumb: float = Field(default=0.6, ge=0, le=1)
     """A sub-flock with less than this fraction of the largest one's sheep waits until the others are home."""
     loyalty: float = Field(default=4.0, ge=0)
     """Another sub-flock is taken up before the one at work is home only if its furthest sheep is this much nearer."""

@@ -85,14 +85,14 @@ class Pierson(Team):
 
 @settings
 class PiersonGains(Settings):
-    """Gains of the reconstructed variant: ours, of the size that re-implementations use."""
+    """Gains of the reconstructed variant: ours; k, l and K are of the size that re-implementations use."""
 
     gain: float = Field(default=0.25, gt=0)
     """k [1/s]."""
     ahead: float = Field(default=2.0, ge=0)
     """l, from the centroid to the point that is drawn to the goal [m]."""
-    radius: float = Field(default=6.0, gt=0)
-    """r [m]."""
+    radius: float = Field(default=9.5, gt=0)
+    """r [m]: just within the 10 m at which shepherds are felt; at 8 m and less the closed ring scatters the flock."""
     tracking: float = Field(default=1.0, gt=0)
     """K [1/s]."""
 
