@@ -4,14 +4,34 @@ from collections.abc import Callable
 
 from .base import Controller
 from .baselines import Idle, Random
+from .elfiqi import Elfiqi, ElfiqiLiteral
+from .occlusion import Occlusion
+from .pierson import Pierson, PiersonReconstructed
 from .strombom import StrombomLiteral, StrombomTeam
 
-__all__ = ["CONTROLLERS", "Controller", "Idle", "Random", "StrombomLiteral", "StrombomTeam"]
+__all__ = [
+    "CONTROLLERS",
+    "Controller",
+    "Elfiqi",
+    "ElfiqiLiteral",
+    "Idle",
+    "Occlusion",
+    "Pierson",
+    "PiersonReconstructed",
+    "Random",
+    "StrombomLiteral",
+    "StrombomTeam",
+]
 
 CONTROLLERS: dict[str, Callable[[], Controller]] = {
     "idle": Idle,
     "random": Random,
     "strombom": StrombomTeam,
     "strombom-literal": StrombomLiteral,
+    "pierson": Pierson,
+    "pierson-reconstructed": PiersonReconstructed,
+    "elfiqi": Elfiqi,
+    "elfiqi-literal": ElfiqiLiteral,
+    "occlusion": Occlusion,
 }
 """By name, for the command line; each call makes a fresh one."""

@@ -11,13 +11,8 @@ For M shepherds (the V formation of Fujioka 2018, distinct outliers): shepherd k
 those left over drive at GCM + r_a sqrt(N) Rot(theta_k) unit(GCM - goal), theta_k = (k - (M - 1) / 2) 35 degrees.
 
 At this scale (r_a = 0.4 m, shepherds felt at 10 m) the r_a-scaled stand-offs stand inside the flock and scatter it. The
-tuned controller keeps the two modes and the V and adds what the method as published has no answer to:
-
-* stand-offs of its own;
-* split flocks: the centroid between two flocks means nothing, so it works on one sub-flock (single linkage) at a time;
-* it walks round a flock, and round what is delivered, not through it;
-* a terminal rule: it never drives from nearer to the goal than the ring at which shepherds hold a flock, lets go once
-  the flock is home, and then rings the goal.
+tuned controller keeps the two modes and the V, with stand-offs of its own, and adds what the method as published has no
+answer to: one sub-flock at a time and a terminal rule (`shepherd_phys.controllers.formation`).
 """
 
 from __future__ import annotations
@@ -28,15 +23,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from shepherd_phys.settings import Settings, settings
-from shepherd_phys.state import Floats, WorldState, centroid, sub_flocks, unit
+from shepherd_phys.settings import settings
+from shepherd_phys.state import Floats, WorldState, centroid, unit
 
-WEDGE = 0.35
-"""How far ahead along the edge of a disc a shepherd aims that walks round it [rad]."""
+from .formation import Team, TeamSettings, walk
 
 
 @settings
-class StrombomSettings(Settings):
+class StrombomSettings(TeamSettings):
     """Lengths in metres, angles in radians; symbols of the 2014 paper.
 
     The defaults were tuned by hand on a few episodes of the tuning seeds (three shepherds, one and two flocks).
@@ -48,89 +42,24 @@ class StrombomSettings(Settings):
     """Behind the centroid; r_a sqrt(N) in the paper."""
     flock_radius: float = Field(default=5.0, gt=0)
     """f(N): a sheep further than this from the centroid is an outlier; r_a N^(2/3) in the paper."""
-    stop_distance: float = Field(default=2.0, ge=0)
-    """A shepherd this near to a sheep does not move on; 3 r_a in the paper."""
     v_angle: float = Field(default=np.deg2rad(35.0), ge=0)
     """Between neighbouring shepherds of the V (Fujioka 2018)."""
-    noise: float = Field(default=0.0, ge=0)
-    """e, weight of a random direction in the shepherd's own; 0.3 in the paper."""
-    link: float = Field(default=3.0, gt=0)
-    """Sheep nearer than this belong to one sub-flock."""
-    let_go: float = Field(default=3.0, ge=0)
-    """A sub-flock is home when its furthest sheep is within the goal's radius plus this of the goal's centre."""
-    ring: float = Field(default=10.5, gt=0)
-    """Distance from the goal's centre at which shepherds hold a delivered flock, and nearer than which none drives."""
-    ring_out: float = Field(default=11.0, gt=0)
-    """The same for a team of one or two, which cannot ring the flock evenly and must not push it."""
-    berth: float = Field(default=9.0, ge=0)
-    """Nearer than this to a flock's centroid no shepherd passes on its way to the other side."""
 
 
-class StrombomTeam:
+class StrombomTeam(Team):
     """The tuned team: sub-flock by sub-flock, own stand-offs, a terminal rule.
 
     Args:
         settings: its lengths.
     """
 
-    lidar = None
-
     def __init__(self, settings: StrombomSettings | None = None) -> None:
         self.settings = settings or StrombomSettings()
+        super().__init__(self.settings)
 
-    def reset(self, rng: np.random.Generator) -> None:
-        """Take the episode's generator."""
-        self._rng = rng
-
-    def to_dict(self) -> dict[str, Any]:
-        """Its parameters."""
-        return self.settings.to_dict()
-
-    def act(self, observation: NDArray[np.float32], state: WorldState) -> NDArray[np.float64]:
-        """(P, 2)."""
+    def _targets(self, state: WorldState, flocks: list[Floats]) -> Floats:
         s = self.settings
-        ring = s.ring if state.n_shepherds >= 3 else s.ring_out
-        flock = self._active(state)
-        if flock is None:
-            targets = round_about(state.shepherd_pos, self._ring(state, ring), state.goal_pos, ring)
-            return walk(state, targets, 0.0, s.noise, self._rng)
-        targets = team_targets(state, flock, s.flock_radius, s.collect_standoff, s.drive_standoff, s.v_angle)
-        away = targets - state.goal_pos
-        near = np.hypot(away[:, 0], away[:, 1]) < ring
-        targets = np.where(near[:, None], state.goal_pos + ring * unit(away), targets)
-        targets = round_about(state.shepherd_pos, targets, centroid(flock), s.berth)
-        if state.sheep_in_goal.any():
-            targets = round_about(state.shepherd_pos, targets, state.goal_pos, ring)
-        return walk(state, targets, s.stop_distance, s.noise, self._rng)
-
-    def _active(self, state: WorldState) -> Floats | None:
-        """Positions of the sub-flock to work on, or None when all are home.
-
-        The one whose furthest sheep is nearest to the goal comes first: it is soonest done.
-        """
-        out = np.hypot(*(state.sheep_pos - state.goal_pos).T)
-        label = sub_flocks(state.sheep_pos, self.settings.link)
-        home = state.goal_radius + self.settings.let_go
-        reach = np.zeros(label.max() + 1)
-        np.maximum.at(reach, label, out)
-        reach[reach <= home] = np.inf
-        best = int(np.argmin(reach))
-        if not np.isfinite(reach[best]):
-            return None
-        return np.asarray(state.sheep_pos[label == best])
-
-    def _ring(self, state: WorldState, radius: float) -> Floats:
-        """(P, 2) evenly spaced places round the goal, each shepherd near to where it is."""
-        p = state.n_shepherds
-        away = state.shepherd_pos - state.goal_pos
-        bearing = np.arctan2(away[:, 1], away[:, 0])
-        order = np.argsort(bearing)
-        slots = 2 * np.pi * np.arange(p) / max(p, 1)
-        # the turn of the whole ring that moves the team least
-        turn = np.angle(np.exp(1j * (bearing[order] - slots)).sum())
-        place = np.empty(p)
-        place[order] = slots + turn
-        return np.asarray(state.goal_pos + radius * np.stack([np.cos(place), np.sin(place)], axis=1))
+        return team_targets(state, flocks[0], s.flock_radius, s.collect_standoff, s.drive_standoff, s.v_angle)
 
 
 class StrombomLiteral:
@@ -194,57 +123,3 @@ def team_targets(
     outliers = furthest[far[furthest] > flock_radius]
     targets[: len(outliers)] = flock[outliers] + collect * unit(spread[outliers])
     return np.asarray(targets)
-
-
-def round_about(pos: Floats, targets: Floats, center: Floats, radius: float) -> Floats:
-    """Where to walk now so as to reach targets round a disc instead of through it.
-
-    A shepherd whose straight way leads through the disc walks along its edge, the shorter way round; one inside
-    walks outwards and on.
-
-    Args:
-        pos: (P, 2) where the shepherds are [m].
-        targets: (P, 2) where they want to be [m].
-        center: (2,) of the disc [m].
-        radius: of the disc [m].
-
-    Returns:
-        (P, 2) the next places to walk to [m].
-    """
-    way, out = targets - pos, pos - center
-    length = np.hypot(way[:, 0], way[:, 1])
-    ahead = -(way * out).sum(axis=1)  # of the centre along the way, times its length
-    cross = way[:, 0] * -out[:, 1] - way[:, 1] * -out[:, 0]
-    through = (length > 0) & (ahead > 0) & (ahead < length**2) & (np.abs(cross) < radius * length * (1 - 1e-9))
-    here = np.arctan2(out[:, 1], out[:, 0])
-    goal = np.arctan2(*(targets - center).T[::-1])
-    turn = np.angle(np.exp(1j * (goal - here)))
-    bearing = here + np.sign(turn) * np.minimum(np.abs(turn), WEDGE)
-    edge = center + max(radius, 1e-9) * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
-    return np.asarray(np.where(through[:, None], edge, targets))
-
-
-def walk(state: WorldState, targets: Floats, stop: float, noise: float, rng: np.random.Generator) -> Floats:
-    """Actions that take each shepherd to its target: full speed, slower only to arrive on it.
-
-    Args:
-        state: of the world.
-        targets: (P, 2) [m].
-        stop: a shepherd nearer than this to a sheep does not move [m].
-        noise: weight e of a random direction.
-        rng: where that comes from.
-
-    Returns:
-        (P, 2) actions.
-    """
-    way = targets - state.shepherd_pos
-    direction = unit(way)
-    if noise > 0:
-        angle = rng.uniform(0.0, 2 * np.pi, len(way))
-        direction = unit(direction + noise * np.stack([np.cos(angle), np.sin(angle)], axis=1))
-    step = state.shepherd_max_speed * state.control_dt
-    size = np.minimum(np.hypot(way[:, 0], way[:, 1]) / step, 1.0)
-    if stop > 0:
-        near = np.hypot(*(state.sheep_pos[None] - state.shepherd_pos[:, None]).transpose(2, 0, 1)).min(axis=1)
-        size = np.where(near < stop, 0.0, size)
-    return np.asarray(direction * size[:, None])

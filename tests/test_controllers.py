@@ -6,26 +6,18 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scenes import NOTHING, arranged
 
 from shepherd_phys.controllers import CONTROLLERS, Random, StrombomLiteral, StrombomTeam
-from shepherd_phys.controllers.strombom import StrombomSettings, round_about, team_targets, walk
+from shepherd_phys.controllers.formation import ring_places, round_about, walk
+from shepherd_phys.controllers.strombom import StrombomSettings, team_targets
 from shepherd_phys.envs import ShepherdingEnv
 from shepherd_phys.scenario import Scenario
 from shepherd_phys.settings import SettingsError
 from shepherd_phys.state import sub_flocks
 from shepherd_phys.world import World
 
-NOTHING = np.empty(0, dtype=np.float32)
 BASE = {n: World(Scenario(n_sheep=n, n_flocks=1, shepherds=3, goal_pos=(0.0, 0.0))).reset(0) for n in (1, 4, 10)}
-
-
-def arranged(sheep, shepherds, goal=(0.0, 0.0)):
-    sheep, shepherds = np.array(sheep, float), np.array(shepherds, float)
-    template = World(Scenario(n_sheep=len(sheep), n_flocks=1, shepherds=len(shepherds))).reset(0)
-    away = np.linalg.norm(sheep - goal, axis=1)
-    return template.but(
-        sheep_pos=sheep, shepherd_pos=shepherds, goal_pos=goal, sheep_in_goal=away <= 2.5, sheep_arrived=away <= 2.5
-    )
 
 
 def test_driving_in_a_v_behind_the_centroid():
@@ -70,9 +62,7 @@ def test_walking_slows_only_to_arrive():
 
 def test_terminal_rule_rings_a_delivered_flock_evenly_beyond_its_influence():
     state = arranged([[0.5, 0], [-0.5, 0], [0, 0.5], [0, -0.5]], [[9, 1], [-9, 1], [0, -9]])
-    team = StrombomTeam()
-    team.reset(np.random.default_rng(0))
-    places = team._ring(state, 10.0)
+    places = ring_places(state, 10.0)
     assert np.linalg.norm(places, axis=1) == pytest.approx([10.0] * 3)
     bearing = np.sort(np.arctan2(places[:, 1], places[:, 0]))
     assert np.diff(bearing) == pytest.approx([2 * math.pi / 3] * 2)

@@ -1,0 +1,266 @@
+"""What the tuned teams share: which sub-flock to work on, how to get there, and a terminal rule.
+
+Methods that know one flock and one centroid have no answer to split flocks, and drive a delivered flock out again: a
+shepherd within 10 m keeps sheep moving. Whatever its own rule, a tuned team
+
+* works on sub-flocks (single linkage), soonest done first, each until its furthest sheep is `let_go` from the goal;
+* never drives from nearer to the goal's centre than the ring at which shepherds hold a flock;
+* walks round a flock, and round what is delivered, not through it;
+* rings the goal evenly once every sub-flock is home.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pymunk
+from numpy.typing import NDArray
+from pydantic import Field
+
+from shepherd_phys.geometry import OBSTACLES, Geometry, compile_shapes
+from shepherd_phys.obstacles import Obstacle, solid
+from shepherd_phys.settings import Settings, settings
+from shepherd_phys.state import Floats, WorldState, centroid, sub_flocks, unit
+
+WEDGE = 0.35
+"""How far ahead along the edge of a disc a shepherd aims that walks round it [rad]."""
+
+
+@settings
+class TeamSettings(Settings):
+    """Lengths in metres. The defaults were tuned by hand on a few episodes of the tuning seeds."""
+
+    stop_distance: float = Field(default=2.0, ge=0)
+    """A shepherd this near to a sheep does not move on."""
+    noise: float = Field(default=0.0, ge=0)
+    """Weight of a random direction in the shepherd's own."""
+    link: float = Field(default=3.0, gt=0)
+    """Sheep nearer than this belong to one sub-flock."""
+    let_go: float = Field(default=3.0, ge=0)
+    """A sub-flock is home when its furthest sheep is within the goal's radius plus this of the goal's centre."""
+    ring: float = Field(default=10.5, gt=0)
+    """Distance from the goal's centre at which shepherds hold a delivered flock, and nearer than which none drives."""
+    ring_out: float = Field(default=12.0, gt=0)
+    """The same for a team of one or two, which stands where sheep lean out and is felt up to 2 m from the centre."""
+    crumb: float = Field(default=0.6, ge=0, le=1)
+    """A sub-flock with less than this fraction of the largest one's sheep waits until the others are home."""
+    loyalty: float = Field(default=4.0, ge=0)
+    """Another sub-flock is taken up before the one at work is home only if its furthest sheep is this much nearer."""
+    berth: float = Field(default=9.0, ge=0)
+    """Nearer than this to a flock's centroid no shepherd passes on its way to the other side."""
+
+
+class Team:
+    """A tuned team; a method fills in `_targets`.
+
+    Args:
+        settings: its lengths.
+    """
+
+    lidar = None
+
+    def __init__(self, settings: TeamSettings) -> None:
+        self._common = settings
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Take the episode's generator."""
+        self._rng = rng
+        self._at: Floats | None = None  # centroid of the sub-flock last at work
+
+    def to_dict(self) -> dict[str, Any]:
+        """Its parameters."""
+        return self._common.to_dict()
+
+    def act(self, observation: NDArray[np.float32], state: WorldState) -> NDArray[np.float64]:
+        """(P, 2)."""
+        s = self._common
+        ring = s.ring if state.n_shepherds >= 3 else s.ring_out
+        flocks = flocks_out(state, s.link, state.goal_radius + s.let_go, s.crumb)
+        if not flocks:
+            self._at = None
+            places = ring_places(state, ring) if state.n_shepherds >= 3 else leak_places(state, ring)
+            targets = round_about(state.shepherd_pos, places, state.goal_pos, ring)
+            return walk(state, targets, 0.0, s.noise, self._rng)
+        flocks = self._kept_first(state, flocks)
+        self._at = centroid(flocks[0])
+        targets = beyond(self._targets(state, flocks), state.goal_pos, ring)
+        targets = self._way(state, targets, flocks)
+        if state.sheep_in_goal.any():
+            targets = round_about(state.shepherd_pos, targets, state.goal_pos, ring)
+        return walk(state, targets, s.stop_distance, s.noise, self._rng)
+
+    def _kept_first(self, state: WorldState, flocks: list[Floats]) -> list[Floats]:
+        """The sub-flocks with the one last at work first, unless another is now much sooner done.
+
+        Without this a team between two equal flocks turns from one to the other for ever, frightening each away.
+        """
+        if self._at is None:
+            return flocks
+        kept = int(np.argmin([np.hypot(*(centroid(flock) - self._at)) for flock in flocks]))
+        if len(flocks[kept]) < self._common.crumb * max(map(len, flocks)):
+            return flocks
+        reach = [float(np.hypot(*(flocks[i] - state.goal_pos).T).max()) for i in (0, kept)]
+        if reach[1] - reach[0] > self._common.loyalty:
+            return flocks
+        return [flocks[kept], *flocks[:kept], *flocks[kept + 1 :]]
+
+    def _targets(self, state: WorldState, flocks: list[Floats]) -> Floats:
+        """(P, 2) where the method wants the shepherds, given the sub-flocks (K, 2) not yet home, the first at work."""
+        raise NotImplementedError
+
+    def _way(self, state: WorldState, targets: Floats, flocks: list[Floats]) -> Floats:
+        """(P, 2) the next places to walk to: round the sub-flock at work."""
+        return round_about(state.shepherd_pos, targets, centroid(flocks[0]), self._common.berth)
+
+
+class Surroundings:
+    """The obstacles of an episode as surfaces, compiled once."""
+
+    def __init__(self) -> None:
+        self._obstacles: tuple[Obstacle, ...] = ()
+        self._geometry = compile_shapes(())
+
+    def of(self, obstacles: tuple[Obstacle, ...]) -> Geometry:
+        """Their surfaces."""
+        if obstacles is not self._obstacles:
+            body = pymunk.Body(body_type=pymunk.Body.STATIC)
+            shapes = [shape for i, obstacle in enumerate(obstacles) for shape in solid(obstacle, i, body)]
+            self._geometry = compile_shapes((shape, -1, OBSTACLES) for shape in shapes)
+            self._obstacles = obstacles
+        return self._geometry
+
+
+def flocks_out(state: WorldState, link: float, home: float, crumb: float = 0.0) -> list[Floats]:
+    """Positions (K, 2) of each sub-flock that is not home; first the one whose furthest sheep is nearest to the goal.
+
+    Crumbs come after all others: a team after one sheep would frighten away the flock beside it.
+
+    Args:
+        state: of the world.
+        link: sheep nearer than this belong together [m].
+        home: a sub-flock with all sheep this near to the goal's centre is home [m].
+        crumb: a sub-flock with less than this fraction of the sheep of the largest not home is one.
+    """
+    out = np.hypot(*(state.sheep_pos - state.goal_pos).T)
+    label = sub_flocks(state.sheep_pos, link)
+    reach = np.zeros(label.max() + 1)
+    np.maximum.at(reach, label, out)
+    wild = np.flatnonzero(reach > home)
+    if not len(wild):
+        return []
+    size = np.bincount(label)[wild]
+    order = np.lexsort((reach[wild], size < crumb * size.max()))
+    return [np.asarray(state.sheep_pos[label == i]) for i in wild[order]]
+
+
+def ring_places(state: WorldState, radius: float) -> Floats:
+    """(P, 2) evenly spaced places on a circle round the goal, each shepherd near to where it is."""
+    p = state.n_shepherds
+    away = state.shepherd_pos - state.goal_pos
+    bearing = np.arctan2(away[:, 1], away[:, 0])
+    order = np.argsort(bearing)
+    slots = 2 * np.pi * np.arange(p) / max(p, 1)
+    # the turn of the whole ring that moves the team least
+    turn = np.angle(np.exp(1j * (bearing[order] - slots)).sum())
+    place = np.empty(p)
+    place[order] = slots + turn
+    return np.asarray(state.goal_pos + radius * heading(place))
+
+
+def leak_places(state: WorldState, radius: float) -> Floats:
+    """(P, 2) places on a circle round the goal for a team too small to ring it: where sheep lean out.
+
+    The first place is behind the sheep furthest from the goal's centre, the others evenly round from there.
+    """
+    p = state.n_shepherds
+    out = state.sheep_pos - state.goal_pos
+    first = bearing_of(out[np.argmax(np.hypot(*out.T))])
+    places = state.goal_pos + radius * heading(first + 2 * np.pi * np.arange(p) / max(p, 1))
+    if (
+        p == 2
+        and np.hypot(*(places - state.shepherd_pos).T).sum() > np.hypot(*(places[::-1] - state.shepherd_pos).T).sum()
+    ):
+        places = places[::-1]
+    return np.asarray(places)
+
+
+def heading(angle: Floats) -> Floats:
+    """Unit vectors (..., 2) at angles (...) from the x axis [rad]."""
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
+def bearing_of(vectors: Floats) -> Floats:
+    """Angles (...) of vectors (..., 2) from the x axis [rad]; 0 for a vector of length 0."""
+    return np.asarray(np.arctan2(vectors[..., 1], vectors[..., 0]))
+
+
+def wrapped(angle: Floats) -> Floats:
+    """The same angles in [-pi, pi] [rad]."""
+    return np.asarray(np.angle(np.exp(1j * angle)))
+
+
+def beyond(targets: Floats, center: Floats, radius: float) -> Floats:
+    """Targets (P, 2), those nearer than ``radius`` to ``center`` moved straight out to that distance [m]."""
+    away = targets - center
+    near = np.hypot(away[:, 0], away[:, 1]) < radius
+    return np.asarray(np.where(near[:, None], center + radius * unit(away), targets))
+
+
+def limited(action: Floats) -> Floats:
+    """Actions (P, 2), those longer than 1 cut to length 1."""
+    return np.asarray(action / np.maximum(np.hypot(action[:, 0], action[:, 1]), 1.0)[:, None])
+
+
+def round_about(pos: Floats, targets: Floats, center: Floats, radius: float) -> Floats:
+    """Where to walk now so as to reach targets round a disc instead of through it.
+
+    A shepherd whose straight way leads through the disc walks along its edge, the shorter way round; one inside
+    walks outwards and on.
+
+    Args:
+        pos: (P, 2) where the shepherds are [m].
+        targets: (P, 2) where they want to be [m].
+        center: (2,) of the disc [m].
+        radius: of the disc [m].
+
+    Returns:
+        (P, 2) the next places to walk to [m].
+    """
+    way, out = targets - pos, pos - center
+    length = np.hypot(way[:, 0], way[:, 1])
+    ahead = -(way * out).sum(axis=1)  # of the centre along the way, times its length
+    cross = way[:, 0] * -out[:, 1] - way[:, 1] * -out[:, 0]
+    through = (length > 0) & (ahead > 0) & (ahead < length**2) & (np.abs(cross) < radius * length * (1 - 1e-9))
+    here = np.arctan2(out[:, 1], out[:, 0])
+    goal = np.arctan2(*(targets - center).T[::-1])
+    turn = np.angle(np.exp(1j * (goal - here)))
+    bearing = here + np.sign(turn) * np.minimum(np.abs(turn), WEDGE)
+    edge = center + max(radius, 1e-9) * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
+    return np.asarray(np.where(through[:, None], edge, targets))
+
+
+def walk(state: WorldState, targets: Floats, stop: float, noise: float, rng: np.random.Generator) -> Floats:
+    """Actions that take each shepherd to its target: full speed, slower only to arrive on it.
+
+    Args:
+        state: of the world.
+        targets: (P, 2) [m].
+        stop: a shepherd nearer than this to a sheep does not move [m].
+        noise: weight e of a random direction.
+        rng: where that comes from.
+
+    Returns:
+        (P, 2) actions.
+    """
+    way = targets - state.shepherd_pos
+    direction = unit(way)
+    if noise > 0:
+        angle = rng.uniform(0.0, 2 * np.pi, len(way))
+        direction = unit(direction + noise * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+    step = state.shepherd_max_speed * state.control_dt
+    size = np.minimum(np.hypot(way[:, 0], way[:, 1]) / step, 1.0)
+    if stop > 0:
+        near = np.hypot(*(state.sheep_pos[None] - state.shepherd_pos[:, None]).transpose(2, 0, 1)).min(axis=1)
+        size = np.where(near < stop, 0.0, size)
+    return np.asarray(direction * size[:, None])

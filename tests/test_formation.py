@@ -1,0 +1,76 @@
+"""What the tuned teams share: sub-flocks in order, places round the goal."""
+
+import numpy as np
+import pytest
+from scenes import NOTHING, arranged
+
+from shepherd_phys.controllers import CONTROLLERS
+from shepherd_phys.controllers.formation import Surroundings, beyond, flocks_out, leak_places
+from shepherd_phys.controllers.strombom import StrombomTeam
+from shepherd_phys.envs import ShepherdingEnv
+from shepherd_phys.obstacles import Pillar
+from shepherd_phys.scenario import Scenario
+
+TUNED = ("strombom", "pierson", "elfiqi", "occlusion")
+
+
+def flocks(*places):
+    """Ten sheep at each place."""
+    return [list(place) for place in places for _ in range(10)]
+
+
+def test_sub_flocks_not_home_soonest_done_first_and_crumbs_last():
+    sheep = [*flocks([20, 0], [0, 12], [-5, 0]), [7, 7]]
+    state = arranged(sheep, [[30, 0]])
+    assert [f[0].tolist() for f in flocks_out(state, 3.0, 5.5)] == [[7, 7], [0, 12], [20, 0]]
+    assert [f[0].tolist() for f in flocks_out(state, 3.0, 5.5, crumb=0.2)] == [[0, 12], [20, 0], [7, 7]]
+    assert flocks_out(state, 3.0, 25.0, crumb=0.2) == []
+
+
+def test_a_team_keeps_to_its_sub_flock_until_another_is_much_sooner_done():
+    team = StrombomTeam()
+    team.reset(np.random.default_rng(0))
+
+    def at_work(*places):
+        state = arranged(flocks(*places), [[0, 20]] * 3)
+        team.act(NOTHING, state)
+        return team._at.tolist()
+
+    assert at_work([15, 0], [-16, 0]) == [15, 0]
+    assert at_work([17, 0], [-16, 0]) == [17, 0]
+    assert at_work([20.5, 0], [-16, 0]) == [-16, 0]
+
+
+def test_a_small_team_stands_behind_the_sheep_that_leans_out_furthest():
+    state = arranged([[1, 0], [0, -3], [-2, 0]], [[0, 20]])
+    assert leak_places(state, 12.0) == pytest.approx(np.array([[0, -12]]))
+    pair = arranged([[1, 0], [0, -3], [-2, 0]], [[1, 20], [0, -20]])
+    assert leak_places(pair, 12.0) == pytest.approx(np.array([[0, 12], [0, -12]]), abs=1e-9)
+
+
+def test_targets_too_near_the_goal_move_straight_out():
+    moved = beyond(np.array([[3.0, 4.0], [12.0, 0.0]]), np.zeros(2), 10.0)
+    assert moved == pytest.approx(np.array([[6.0, 8.0], [12.0, 0.0]]))
+
+
+def test_surroundings_are_compiled_once_for_an_episode():
+    surroundings, obstacles = Surroundings(), (Pillar((5.0, 0.0), 1.0),)
+    geometry = surroundings.of(obstacles)
+    distance, away = geometry.static_distances(np.array([[0.0, 0.0]]))
+    assert distance.tolist() == [[4.0]]
+    assert away[0, 0].tolist() == [-1.0, 0.0]
+    assert surroundings.of(obstacles) is geometry
+    assert surroundings.of((Pillar((9.0, 0.0), 1.0),)) is not geometry
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("n_shepherds", [1, 2, 3, 6])
+@pytest.mark.parametrize("name", TUNED)
+def test_every_tuned_team_delivers_two_flocks_and_holds_them(name, n_shepherds):
+    env = ShepherdingEnv(Scenario(n_flocks=2, shepherds=n_shepherds), rewards={}, lidar=None)
+    controller = CONTROLLERS[name]()
+    observation, _ = env.reset(seed=1)
+    controller.reset(env.user_rng)
+    for _ in range(1000):
+        observation, *_, info = env.step(controller.act(observation, env.state))
+    assert info["in_goal"] > 0.9
