@@ -33,7 +33,7 @@ from pydantic import Field
 from shepherd_phys.settings import Settings, settings
 from shepherd_phys.state import Floats, WorldState, centroid, unit
 
-from .formation import Surroundings, Team, TeamSettings, bearing_of, heading, limited, wrapped
+from .formation import Surroundings, Team, TeamSettings, bearing_of, heading, in_order, limited, wrapped
 
 MU = 2.0
 """mu, how fast repulsion fades."""
@@ -78,9 +78,9 @@ class Elfiqi(Team):
         drivers = np.flatnonzero(stray < 0)
         behind = bearing_of(gcm - state.goal_pos)
         theta = (np.arange(len(drivers)) - (len(drivers) - 1) / 2) * np.pi / (2 * m)
-        # places from right to left go to drivers from right to left: nobody crosses the fan
-        now = wrapped(bearing_of(state.shepherd_pos[drivers] - gcm) - behind)
-        targets[drivers[np.argsort(now, kind="stable")]] = gcm + s.drive_distance * heading(behind + theta)
+        slots = behind + theta
+        taken = in_order(bearing_of(state.shepherd_pos[drivers] - gcm), slots)
+        targets[drivers] = gcm + s.drive_distance * heading(slots[taken])
         return targets
 
 

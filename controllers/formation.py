@@ -185,6 +185,24 @@ def leak_places(state: WorldState, radius: float) -> Floats:
     return np.asarray(places)
 
 
+def in_order(bearing: Floats, slots: Floats) -> NDArray[np.int64]:
+    """(P,) the slot of each shepherd, in the order in which they stand round a flock, with the least turning in all.
+
+    Nobody crosses another's way: two that meet head-on block each other.
+
+    Args:
+        bearing: (P,) of the shepherds from the flock's centroid [rad].
+        slots: (P,) bearings of the slots, rising, less than a turn apart [rad].
+    """
+    p = len(slots)
+    order = np.argsort(wrapped(bearing), kind="stable")
+    shifts = [(np.arange(p) + k) % p for k in range(p)]
+    taken = np.empty(p, np.int64)
+    if p:
+        taken[order] = min(shifts, key=lambda shift: float(np.abs(wrapped(slots[shift] - bearing[order])).sum()))
+    return taken
+
+
 def heading(angle: Floats) -> Floats:
     """Unit vectors (..., 2) at angles (...) from the x axis [rad]."""
     return np.stack([np.cos(angle), np.sin(angle)], axis=-1)

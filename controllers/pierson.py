@@ -31,7 +31,7 @@ from pydantic import Field
 from shepherd_phys.settings import Settings, settings
 from shepherd_phys.state import Floats, WorldState, centroid
 
-from .formation import Team, TeamSettings, bearing_of, heading, limited, wrapped
+from .formation import Team, TeamSettings, bearing_of, heading, in_order, limited
 
 HALVINGS = 50
 """Steps of the search for the arc's width."""
@@ -77,10 +77,8 @@ class Pierson(Team):
         far = np.hypot(*(flock - gcm).T)
         radius = min(max((far.mean() + far.max()) / 2 + s.standoff, s.min_radius), s.max_radius)
         places = arc_places(gcm, float(bearing_of(to_goal)), float(radius), arc, state.n_shepherds)
-        behind = wrapped(bearing_of(state.shepherd_pos - gcm) - bearing_of(-to_goal))
-        targets = np.empty_like(places)
-        targets[np.argsort(behind, kind="stable")] = places
-        return targets
+        slots = np.unwrap(bearing_of(places - gcm))
+        return np.asarray(places[in_order(bearing_of(state.shepherd_pos - gcm), slots)])
 
 
 @settings

@@ -5,7 +5,7 @@ import pytest
 from scenes import NOTHING, arranged
 
 from shepherd_phys.controllers import CONTROLLERS
-from shepherd_phys.controllers.formation import Surroundings, beyond, flocks_out, leak_places
+from shepherd_phys.controllers.formation import Surroundings, beyond, flocks_out, in_order, leak_places
 from shepherd_phys.controllers.strombom import StrombomTeam
 from shepherd_phys.envs import ShepherdingEnv
 from shepherd_phys.obstacles import Pillar
@@ -46,6 +46,13 @@ def test_a_small_team_stands_behind_the_sheep_that_leans_out_furthest():
     assert leak_places(state, 12.0) == pytest.approx(np.array([[0, -12]]))
     pair = arranged([[1, 0], [0, -3], [-2, 0]], [[1, 20], [0, -20]])
     assert leak_places(pair, 12.0) == pytest.approx(np.array([[0, 12], [0, -12]]), abs=1e-9)
+
+
+def test_slots_are_taken_without_crossing_on_the_far_side_too():
+    """Both just short of 180 degrees: the two go round opposite ways, each the one nearer to it."""
+    assert in_order(np.deg2rad([177.0, 174.0]), np.deg2rad([-30.0, 30.0])).tolist() == [0, 1]
+    assert in_order(np.deg2rad([20.0, -20.0]), np.deg2rad([-30.0, 30.0])).tolist() == [1, 0]
+    assert in_order(np.empty(0), np.empty(0)).tolist() == []
 
 
 def test_targets_too_near_the_goal_move_straight_out():
