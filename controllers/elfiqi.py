@@ -19,7 +19,8 @@ Deviations of the literal variant: angles are wrapped, which the code forgets; o
 their surface.
 
 The tuned team works on one sub-flock at a time and has a terminal rule (`shepherd_phys.controllers.formation`); its
-drivers fan out to fixed places instead of following one another, and it keeps a narrower circle.
+drivers fan out to fixed places instead of following one another, and it walks round at the berth that all tuned
+teams keep.
 """
 
 from __future__ import annotations
