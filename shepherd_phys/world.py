@@ -319,8 +319,8 @@ class World:
         self._sensors: dict[Lidar, Sensor] = {}
         self._sensor: Sensor | None = None
 
-        # the static body, once touched, is the last row of every batch
-        n_rows = n + p + (1 if static else 0)
+        # the static body is the last row of every batch once anybody has touched it: do, so that it always is
+        n_rows = len([*bodies, space.static_body])
         self._command = np.zeros((n + p, 3))
         self._poses = np.zeros((n + p, 3))
         self._force = np.zeros((n_rows, 3 if self._spins else 2))
@@ -425,6 +425,8 @@ class World:
         """One batch read: (rows, 4) x, y, vx, vy or (rows, 6) x, y, angle, vx, vy, spin; the next one overwrites it."""
         self._read_buffer.clear()
         batch.get_space_bodies(self.space, self._fields, self._read_buffer)
+        if len(self._read_buffer.float_buf()) != self._rows.nbytes:  # then pymunk's memory may have moved, too
+            raise RuntimeError("bodies were added to the world's space, or removed: it holds the scenario's alone")
         return self._rows
 
     def _measure(

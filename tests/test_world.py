@@ -454,6 +454,17 @@ def test_obstacles_that_give_something_else_or_too_thin_shapes_are_named():
             lone(obstacles=(Odd(make),)).reset(0)
 
 
+def test_the_space_may_be_looked_at_but_bodies_may_not_be_added():
+    world = World(SMALL)
+    world.reset(0)
+    assert world.space.static_body.position == (0, 0)
+    world.step(np.zeros((2, 2)))
+    body = pymunk.Body(1.0, 1.0)
+    world.space.add(body, pymunk.Circle(body, 0.1))
+    with pytest.raises(RuntimeError, match="bodies were added to the world's space"):
+        world.step(np.zeros((2, 2)))
+
+
 def test_a_class_in_place_of_an_object_is_named():
     with pytest.raises(SettingsError, match=r"Disc: a class was given; make one of it: Disc\(\)"):
         lone(shepherds=(Disc,))
