@@ -41,8 +41,6 @@ SHEEP_SETS = {
 }
 """Sheep that can be scanned on their own: never been in the goal; outside it now."""
 
-RELAX_SWEEPS = 1_000
-"""Sweeps after which placing gives up: 100 sheep at the paper's density need about 15, 10,000 about 350."""
 
 PLACE_TRIES = 200
 """Draws of a placement among obstacles after which it is given up."""
@@ -165,7 +163,6 @@ class World:
             np.concatenate([sheep_pos, shepherd_pos]),
             np.array([reach for _, _, reach in bodies]),
             push_out=solids.push_out if static else None,
-            max_sweeps=RELAX_SWEEPS,
         )
         angle = self._noise.uniform(0.0, 2 * np.pi, self._n)
         motion = np.zeros((self._n + self._p, 6))
