@@ -65,7 +65,7 @@ lock: build/.installed  ## write requirements.lock anew, keeping the versions it
 	sed -i.old -e 's/+cpu$$//' -e '/^pip==/d' requirements.lock && rm requirements.lock.old
 
 clean-kernels:  ## forget numba's compiled kernels
-	find shepherd_phys envs build -name '*.nb[ic]' -exec rm -f {} +
+	find shepherd_phys envs controllers build -name '*.nb[ic]' -exec rm -f {} +
 
 clean:  ## remove everything that was made, results and runs excepted
 	rm -rf .venv build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .benchmarks

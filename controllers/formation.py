@@ -6,15 +6,18 @@ shepherd within 10 m keeps sheep moving. Whatever its own rule, a tuned team
 * works on sub-flocks (single linkage), soonest done first, each until its furthest sheep is `let_go` from the goal;
 * never drives from nearer to the goal's centre than the ring at which shepherds hold a flock;
 * walks round a flock, and round what is delivered, not through it;
-* rings the goal evenly once every sub-flock is home.
+* rings the goal evenly once every sub-flock is home;
+* walks, and leads a flock, round obstacles (`shepherd_phys.controllers.routes`).
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 import pymunk
+from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
@@ -22,6 +25,8 @@ from shepherd_phys.geometry import OBSTACLES, Geometry, compile_shapes
 from shepherd_phys.obstacles import Obstacle, solid
 from shepherd_phys.settings import Settings, settings
 from shepherd_phys.state import Floats, WorldState, centroid, sub_flocks, unit
+
+from .routes import Routes
 
 WEDGE = 0.35
 """How far ahead along the edge of a disc a shepherd aims that walks round it [rad]."""
@@ -49,6 +54,10 @@ class TeamSettings(Settings):
     """Another sub-flock is taken up before the one at work is home only if its furthest sheep is this much nearer."""
     berth: float = Field(default=9.0, ge=0)
     """Nearer than this to a flock's centroid no shepherd passes on its way to the other side."""
+    clearance: float = Field(default=0.5, gt=0)
+    """A shepherd's centre keeps this far from obstacles; more than its radius."""
+    flock_clearance: float = Field(default=1.5, gt=0)
+    """A flock is led round obstacles so that its centroid keeps this far from them, where there is such a way."""
 
 
 class Team:
@@ -62,6 +71,8 @@ class Team:
 
     def __init__(self, settings: TeamSettings) -> None:
         self._common = settings
+        self._surroundings = Surroundings()
+        self._routes: tuple[Geometry, Routes, Routes] | None = None  # round which obstacles: shepherds', flocks'
 
     def reset(self, rng: np.random.Generator) -> None:
         """Take the episode's generator."""
@@ -75,20 +86,38 @@ class Team:
     def act(self, observation: NDArray[np.float32], state: WorldState) -> NDArray[np.float64]:
         """(P, 2)."""
         s = self._common
+        if state.obstacles:
+            geometry = self._surroundings.of(state.obstacles)
+            if self._routes is None or self._routes[0] is not geometry:
+                self._routes = geometry, Routes(geometry, s.clearance), Routes(geometry, s.flock_clearance)
+        targets, stop = self._wanted(state)
+        if state.obstacles and self._routes is not None:
+            targets = self._routes[1].towards(state.shepherd_pos, targets)
+        return walk(state, targets, stop, s.noise, self._rng)
+
+    def _wanted(self, state: WorldState) -> tuple[Floats, float]:
+        """(P, 2) where to walk now, but for obstacles, and how near to sheep to stop [m]."""
+        s = self._common
         ring = s.ring if state.n_shepherds >= 3 else s.ring_out
         flocks = flocks_out(state, s.link, state.goal_radius + s.let_go, s.crumb)
         if not flocks:
             self._at = None
             places = ring_places(state, ring) if state.n_shepherds >= 3 else leak_places(state, ring)
-            targets = round_about(state.shepherd_pos, places, state.goal_pos, ring)
-            return walk(state, targets, 0.0, s.noise, self._rng)
+            return round_about(state.shepherd_pos, places, state.goal_pos, ring), 0.0
         flocks = self._kept_first(state, flocks)
         self._at = centroid(flocks[0])
-        targets = beyond(self._targets(state, flocks), state.goal_pos, ring)
+        targets = beyond(self._targets(self._led(state), flocks), state.goal_pos, ring)
         targets = self._way(state, targets, flocks)
         if state.sheep_in_goal.any():
             targets = round_about(state.shepherd_pos, targets, state.goal_pos, ring)
-        return walk(state, targets, s.stop_distance, s.noise, self._rng)
+        return targets, s.stop_distance
+
+    def _led(self, state: WorldState) -> WorldState:
+        """The state as the method is to see it: its goal is where the flock at work has to go first."""
+        if not state.obstacles or self._routes is None or self._at is None:
+            return state
+        place = self._routes[2].towards(self._at[None], state.goal_pos[None])[0]
+        return state if np.array_equal(place, state.goal_pos) else state.but(goal_pos=place)
 
     def _kept_first(self, state: WorldState, flocks: list[Floats]) -> list[Floats]:
         """The sub-flocks with the one last at work first, unless another is now much sooner done.
@@ -111,7 +140,7 @@ class Team:
 
     def _way(self, state: WorldState, targets: Floats, flocks: list[Floats]) -> Floats:
         """(P, 2) the next places to walk to: round the sub-flock at work."""
-        return round_about(state.shepherd_pos, targets, centroid(flocks[0]), self._common.berth)
+        return np.asarray(round_about(state.shepherd_pos, targets, centroid(flocks[0]), self._common.berth))
 
 
 class Surroundings:
@@ -142,16 +171,25 @@ def flocks_out(state: WorldState, link: float, home: float, crumb: float = 0.0) 
         home: a sub-flock with all sheep this near to the goal's centre is home [m].
         crumb: a sub-flock with less than this fraction of the sheep of the largest not home is one.
     """
-    out = np.hypot(*(state.sheep_pos - state.goal_pos).T)
-    label = sub_flocks(state.sheep_pos, link)
-    reach = np.zeros(label.max() + 1)
-    np.maximum.at(reach, label, out)
+    label, reach, size = _measured(state.sheep_pos, state.goal_pos, link)
     wild = np.flatnonzero(reach > home)
     if not len(wild):
         return []
-    size = np.bincount(label)[wild]
-    order = np.lexsort((reach[wild], size < crumb * size.max()))
+    order = np.lexsort((reach[wild], size[wild] < crumb * size[wild].max()))
     return [np.asarray(state.sheep_pos[label == i]) for i in wild[order]]
+
+
+@njit(cache=True)
+def _measured(sheep, goal, link):  # type: ignore[no-untyped-def]
+    """Of the sub-flocks: label of each sheep, distance of the furthest one from the goal's centre [m], size."""
+    label = sub_flocks(sheep, link)
+    count = label.max() + 1
+    reach, size = np.zeros(count), np.zeros(count, np.int64)
+    for i in range(len(sheep)):
+        out = math.hypot(sheep[i, 0] - goal[0], sheep[i, 1] - goal[1])
+        reach[label[i]] = max(reach[label[i]], out)
+        size[label[i]] += 1
+    return label, reach, size
 
 
 def ring_places(state: WorldState, radius: float) -> Floats:
@@ -230,7 +268,8 @@ def limited(action: Floats) -> Floats:
     return np.asarray(action / np.maximum(np.hypot(action[:, 0], action[:, 1]), 1.0)[:, None])
 
 
-def round_about(pos: Floats, targets: Floats, center: Floats, radius: float) -> Floats:
+@njit(cache=True)
+def round_about(pos, targets, center, radius):  # type: ignore[no-untyped-def]
     """Where to walk now so as to reach targets round a disc instead of through it.
 
     A shepherd whose straight way leads through the disc walks along its edge, the shorter way round; one inside
@@ -245,17 +284,22 @@ def round_about(pos: Floats, targets: Floats, center: Floats, radius: float) -> 
     Returns:
         (P, 2) the next places to walk to [m].
     """
-    way, out = targets - pos, pos - center
-    length = np.hypot(way[:, 0], way[:, 1])
-    ahead = -(way * out).sum(axis=1)  # of the centre along the way, times its length
-    cross = way[:, 0] * -out[:, 1] - way[:, 1] * -out[:, 0]
-    through = (length > 0) & (ahead > 0) & (ahead < length**2) & (np.abs(cross) < radius * length * (1 - 1e-9))
-    here = np.arctan2(out[:, 1], out[:, 0])
-    goal = np.arctan2(*(targets - center).T[::-1])
-    turn = np.angle(np.exp(1j * (goal - here)))
-    bearing = here + np.sign(turn) * np.minimum(np.abs(turn), WEDGE)
-    edge = center + max(radius, 1e-9) * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
-    return np.asarray(np.where(through[:, None], edge, targets))
+    places = targets.copy()
+    edge = max(radius, 1e-9)
+    for k in range(len(pos)):
+        way_x, way_y = targets[k, 0] - pos[k, 0], targets[k, 1] - pos[k, 1]
+        out_x, out_y = pos[k, 0] - center[0], pos[k, 1] - center[1]
+        length = math.hypot(way_x, way_y)
+        ahead = -(way_x * out_x + way_y * out_y)  # of the centre along the way, times its length
+        cross = way_y * out_x - way_x * out_y
+        if length > 0 and 0 < ahead < length * length and abs(cross) < radius * length * (1 - 1e-9):
+            here = math.atan2(out_y, out_x)
+            there = math.atan2(targets[k, 1] - center[1], targets[k, 0] - center[0])
+            turn = math.atan2(math.sin(there - here), math.cos(there - here))
+            bearing = here + min(max(turn, -WEDGE), WEDGE)
+            places[k, 0] = center[0] + edge * math.cos(bearing)
+            places[k, 1] = center[1] + edge * math.sin(bearing)
+    return places
 
 
 def walk(state: WorldState, targets: Floats, stop: float, noise: float, rng: np.random.Generator) -> Floats:
@@ -271,14 +315,27 @@ def walk(state: WorldState, targets: Floats, stop: float, noise: float, rng: np.
     Returns:
         (P, 2) actions.
     """
-    way = targets - state.shepherd_pos
-    direction = unit(way)
+    pos, step = state.shepherd_pos, state.shepherd_max_speed * state.control_dt
     if noise > 0:
-        angle = rng.uniform(0.0, 2 * np.pi, len(way))
-        direction = unit(direction + noise * np.stack([np.cos(angle), np.sin(angle)], axis=1))
-    step = state.shepherd_max_speed * state.control_dt
-    size = np.minimum(np.hypot(way[:, 0], way[:, 1]) / step, 1.0)
-    if stop > 0:
-        near = np.hypot(*(state.sheep_pos[None] - state.shepherd_pos[:, None]).transpose(2, 0, 1)).min(axis=1)
-        size = np.where(near < stop, 0.0, size)
-    return np.asarray(direction * size[:, None])
+        way = targets - pos
+        direction = unit(unit(way) + noise * heading(rng.uniform(0.0, 2 * np.pi, len(way))))
+        targets = pos + np.hypot(way[:, 0], way[:, 1])[:, None] * direction
+    return np.asarray(_paces(pos, np.asarray(targets, dtype=np.float64), step, state.sheep_pos, stop))
+
+
+@njit(cache=True)
+def _paces(pos, targets, step, sheep, stop):  # type: ignore[no-untyped-def]
+    """(P, 2) towards the targets, 1 long or what is left of the way over ``step`` (P,); 0 near a sheep."""
+    paces = np.zeros_like(pos)
+    for k in range(len(pos)):
+        stands = False
+        for i in range(len(sheep)):
+            dx, dy = sheep[i, 0] - pos[k, 0], sheep[i, 1] - pos[k, 1]
+            if dx * dx + dy * dy < stop * stop:
+                stands = True
+                break
+        if not stands:
+            way_x, way_y = targets[k, 0] - pos[k, 0], targets[k, 1] - pos[k, 1]
+            scale = 1.0 / max(math.hypot(way_x, way_y), step[k])
+            paces[k, 0], paces[k, 1] = way_x * scale, way_y * scale
+    return paces
