@@ -34,7 +34,7 @@ from pydantic import Field
 from shepherd_phys.settings import Settings, settings
 from shepherd_phys.state import Floats, WorldState, centroid, unit
 
-from .formation import Surroundings, Team, TeamSettings, bearing_of, heading, in_order, limited, wrapped
+from .formation import SubFlocks, Surroundings, Team, TeamSettings, bearing_of, heading, in_order, limited, wrapped
 
 MU = 2.0
 """mu, how fast repulsion fades."""
@@ -71,9 +71,9 @@ class Elfiqi(Team):
         self.settings = settings or ElfiqiSettings()
         super().__init__(self.settings)
 
-    def _targets(self, state: WorldState, flocks: list[Floats]) -> Floats:
-        s, flock, m = self.settings, flocks[0], state.n_shepherds
-        gcm = centroid(flock)
+    def _targets(self, state: WorldState, flocks: SubFlocks) -> Floats:
+        s, flock, m = self.settings, flocks.sheep[0], state.n_shepherds
+        gcm = flocks.centers[0]
         stray = nearest_strays(state.shepherd_pos, flock, s.flock_radius)
         targets = collecting_places(flock, stray, s.collect_standoff)
         drivers = np.flatnonzero(stray < 0)

@@ -13,7 +13,7 @@ shepherd within 10 m keeps sheep moving. Whatever its own rule, a tuned team
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pymunk
@@ -24,7 +24,7 @@ from pydantic import Field
 from shepherd_phys.geometry import OBSTACLES, Geometry, compile_shapes
 from shepherd_phys.obstacles import Obstacle, solid
 from shepherd_phys.settings import Settings, settings
-from shepherd_phys.state import Floats, WorldState, centroid, sub_flocks, unit
+from shepherd_phys.state import Floats, WorldState, sub_flocks, unit
 
 from .routes import Routes
 
@@ -100,12 +100,12 @@ class Team:
         s = self._common
         ring = s.ring if state.n_shepherds >= 3 else s.ring_out
         flocks = flocks_out(state, s.link, state.goal_radius + s.let_go, s.crumb)
-        if not flocks:
+        if not flocks.sheep:
             self._at = None
             places = ring_places(state, ring) if state.n_shepherds >= 3 else leak_places(state, ring)
             return round_about(state.shepherd_pos, places, state.goal_pos, ring), 0.0
-        flocks = self._kept_first(state, flocks)
-        self._at = centroid(flocks[0])
+        flocks = self._kept_first(flocks)
+        self._at = flocks.centers[0]
         targets = beyond(self._targets(self._led(state), flocks), state.goal_pos, ring)
         targets = self._way(state, targets, flocks)
         if state.sheep_in_goal.any():
@@ -119,28 +119,28 @@ class Team:
         place = self._routes[2].towards(self._at[None], state.goal_pos[None])[0]
         return state if np.array_equal(place, state.goal_pos) else state.but(goal_pos=place)
 
-    def _kept_first(self, state: WorldState, flocks: list[Floats]) -> list[Floats]:
+    def _kept_first(self, flocks: SubFlocks) -> SubFlocks:
         """The sub-flocks with the one last at work first, unless another is now much sooner done.
 
         Without this a team between two equal flocks turns from one to the other for ever, frightening each away.
         """
-        if self._at is None:
+        if self._at is None or len(flocks.sheep) == 1:
             return flocks
-        kept = int(np.argmin([np.hypot(*(centroid(flock) - self._at)) for flock in flocks]))
-        if len(flocks[kept]) < self._common.crumb * max(map(len, flocks)):
+        x, y = (flocks.centers - self._at).T
+        kept = int(np.argmin(x * x + y * y))
+        if len(flocks.sheep[kept]) < self._common.crumb * max(map(len, flocks.sheep)):
             return flocks
-        reach = [float(np.hypot(*(flocks[i] - state.goal_pos).T).max()) for i in (0, kept)]
-        if reach[1] - reach[0] > self._common.loyalty:
+        if flocks.reach[kept] - flocks.reach[0] > self._common.loyalty:
             return flocks
-        return [flocks[kept], *flocks[:kept], *flocks[kept + 1 :]]
+        return flocks.led_by(kept)
 
-    def _targets(self, state: WorldState, flocks: list[Floats]) -> Floats:
-        """(P, 2) where the method wants the shepherds, given the sub-flocks (K, 2) not yet home, the first at work."""
+    def _targets(self, state: WorldState, flocks: SubFlocks) -> Floats:
+        """(P, 2) where the method wants the shepherds, given the sub-flocks not yet home, the first at work."""
         raise NotImplementedError
 
-    def _way(self, state: WorldState, targets: Floats, flocks: list[Floats]) -> Floats:
+    def _way(self, state: WorldState, targets: Floats, flocks: SubFlocks) -> Floats:
         """(P, 2) the next places to walk to: round the sub-flock at work."""
-        return np.asarray(round_about(state.shepherd_pos, targets, centroid(flocks[0]), self._common.berth))
+        return np.asarray(round_about(state.shepherd_pos, targets, flocks.centers[0], self._common.berth))
 
 
 class Surroundings:
@@ -160,8 +160,24 @@ class Surroundings:
         return self._geometry
 
 
-def flocks_out(state: WorldState, link: float, home: float, crumb: float = 0.0) -> list[Floats]:
-    """Positions (K, 2) of each sub-flock that is not home; first the one whose furthest sheep is nearest to the goal.
+class SubFlocks(NamedTuple):
+    """Sub-flocks that are not home, the first one to be seen to first."""
+
+    sheep: list[Floats]
+    """Positions (K, 2) of each [m]."""
+    centers: Floats
+    """(F, 2) centroids [m]."""
+    reach: Floats
+    """(F,) distance of each one's furthest sheep from the goal's centre [m]."""
+
+    def led_by(self, first: int) -> SubFlocks:
+        """The same, another one first."""
+        order = [first, *(i for i in range(len(self.sheep)) if i != first)]
+        return SubFlocks([self.sheep[i] for i in order], self.centers[order], self.reach[order])
+
+
+def flocks_out(state: WorldState, link: float, home: float, crumb: float = 0.0) -> SubFlocks:
+    """Each sub-flock that is not home; first the one whose furthest sheep is nearest to the goal.
 
     Crumbs come after all others: a team after one sheep would frighten away the flock beside it.
 
@@ -171,25 +187,27 @@ def flocks_out(state: WorldState, link: float, home: float, crumb: float = 0.0) 
         home: a sub-flock with all sheep this near to the goal's centre is home [m].
         crumb: a sub-flock with less than this fraction of the sheep of the largest not home is one.
     """
-    label, reach, size = _measured(state.sheep_pos, state.goal_pos, link)
-    wild = np.flatnonzero(reach > home)
-    if not len(wild):
-        return []
-    order = np.lexsort((reach[wild], size[wild] < crumb * size[wild].max()))
-    return [np.asarray(state.sheep_pos[label == i]) for i in wild[order]]
+    label, reach, size, center = _measured(state.sheep_pos, state.goal_pos, link)
+    wild = (reach > home).nonzero()[0]
+    if len(wild) > 1:
+        wild = wild[np.lexsort((reach[wild], size[wild] < crumb * size[wild].max()))]
+    return SubFlocks([state.sheep_pos[label == i] for i in wild.tolist()], center[wild], reach[wild])
 
 
 @njit(cache=True)
 def _measured(sheep, goal, link):  # type: ignore[no-untyped-def]
-    """Of the sub-flocks: label of each sheep, distance of the furthest one from the goal's centre [m], size."""
+    """Label of each sheep; of the sub-flocks the furthest distance from the goal's centre [m], size, centroid [m]."""
     label = sub_flocks(sheep, link)
     count = label.max() + 1
-    reach, size = np.zeros(count), np.zeros(count, np.int64)
+    reach, size, center = np.zeros(count), np.zeros(count, np.int64), np.zeros((count, 2))
     for i in range(len(sheep)):
         out = math.hypot(sheep[i, 0] - goal[0], sheep[i, 1] - goal[1])
         reach[label[i]] = max(reach[label[i]], out)
         size[label[i]] += 1
-    return label, reach, size
+        center[label[i]] += sheep[i]
+    for flock in range(count):
+        center[flock] /= size[flock]
+    return label, reach, size, center
 
 
 def ring_places(state: WorldState, radius: float) -> Floats:
@@ -223,7 +241,8 @@ def leak_places(state: WorldState, radius: float) -> Floats:
     return np.asarray(places)
 
 
-def in_order(bearing: Floats, slots: Floats) -> NDArray[np.int64]:
+@njit(cache=True)
+def in_order(bearing, slots):  # type: ignore[no-untyped-def]
     """(P,) the slot of each shepherd, in the order in which they stand round a flock, with the least turning in all.
 
     Nobody crosses another's way: two that meet head-on block each other.
@@ -233,11 +252,18 @@ def in_order(bearing: Floats, slots: Floats) -> NDArray[np.int64]:
         slots: (P,) bearings of the slots, rising, less than a turn apart [rad].
     """
     p = len(slots)
-    order = np.argsort(wrapped(bearing), kind="stable")
-    shifts = [(np.arange(p) + k) % p for k in range(p)]
+    order = np.argsort(_wrapped(bearing), kind="mergesort")
     taken = np.empty(p, np.int64)
-    if p:
-        taken[order] = min(shifts, key=lambda shift: float(np.abs(wrapped(slots[shift] - bearing[order])).sum()))
+    least, best = math.inf, 0
+    for shift in range(p):
+        turning = 0.0
+        for i in range(p):
+            away = slots[(i + shift) % p] - bearing[order[i]]
+            turning += abs(math.atan2(math.sin(away), math.cos(away)))
+        if turning < least:
+            least, best = turning, shift
+    for i in range(p):
+        taken[order[i]] = (i + best) % p
     return taken
 
 
@@ -253,14 +279,25 @@ def bearing_of(vectors: Floats) -> Floats:
 
 def wrapped(angle: Floats) -> Floats:
     """The same angles in [-pi, pi] [rad]."""
-    return np.asarray(np.angle(np.exp(1j * angle)))
+    return np.asarray(_wrapped(angle))
 
 
-def beyond(targets: Floats, center: Floats, radius: float) -> Floats:
+@njit(cache=True)
+def _wrapped(angle):  # type: ignore[no-untyped-def]
+    return np.arctan2(np.sin(angle), np.cos(angle))
+
+
+@njit(cache=True)
+def beyond(targets, center, radius):  # type: ignore[no-untyped-def]
     """Targets (P, 2), those nearer than ``radius`` to ``center`` moved straight out to that distance [m]."""
-    away = targets - center
-    near = np.hypot(away[:, 0], away[:, 1]) < radius
-    return np.asarray(np.where(near[:, None], center + radius * unit(away), targets))
+    moved = targets.copy()
+    for k in range(len(targets)):
+        x, y = targets[k, 0] - center[0], targets[k, 1] - center[1]
+        away = math.hypot(x, y)
+        if away < radius:
+            scale = radius / away if away > 0 else 0.0
+            moved[k, 0], moved[k, 1] = center[0] + scale * x, center[1] + scale * y
+    return moved
 
 
 def limited(action: Floats) -> Floats:

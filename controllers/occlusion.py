@@ -15,14 +15,16 @@ R_c is never taken as less than `min_radius`: one sheep hides nothing. The team 
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from shepherd_phys.settings import settings
-from shepherd_phys.state import Floats, WorldState, centroid, unit
+from shepherd_phys.state import Floats, WorldState, unit
 
-from .formation import WEDGE, Team, TeamSettings, bearing_of, heading, wrapped
+from .formation import WEDGE, SubFlocks, Team, TeamSettings, bearing_of, heading, wrapped
 
 
 @settings
@@ -48,17 +50,20 @@ class Occlusion(Team):
         self.settings = settings or OcclusionSettings()
         super().__init__(self.settings)
 
-    def _targets(self, state: WorldState, flocks: list[Floats]) -> Floats:
+    def _targets(self, state: WorldState, flocks: SubFlocks) -> Floats:
         s = self.settings
-        centers = np.array([centroid(flock) for flock in flocks])
-        radii = [max(float(np.hypot(*(f - c).T).max()), s.min_radius) for f, c in zip(flocks, centers, strict=True)]
-        chosen = shared_out(state.shepherd_pos, centers, np.array([len(flock) for flock in flocks]))
-        own, pos = centers[chosen], state.shepherd_pos
+        centers, pos = flocks.centers, state.shepherd_pos
+        chosen = shared_out(pos, centers, np.array([len(flock) for flock in flocks.sheep]))
+        own = centers[chosen]
         facing = unit(pos - own)
-        extents = np.array([((flocks[f] - centers[f]) @ facing[k]).max() for k, f in enumerate(chosen)])
-        return occlusion_targets(pos, state.goal_pos, own, np.array(radii)[chosen], extents + s.approach, s.circle)
+        radii, extents = np.empty(len(pos)), np.empty(len(pos))
+        for k, f in enumerate(chosen.tolist()):
+            spread = flocks.sheep[f] - centers[f]
+            radii[k] = max(math.sqrt((spread * spread).sum(axis=1).max()), s.min_radius)
+            extents[k] = (spread @ facing[k]).max()
+        return occlusion_targets(pos, state.goal_pos, own, radii, extents + s.approach, s.circle)
 
-    def _way(self, state: WorldState, targets: Floats, flocks: list[Floats]) -> Floats:
+    def _way(self, state: WorldState, targets: Floats, flocks: SubFlocks) -> Floats:
         return targets  # circling is part of the method
 
 

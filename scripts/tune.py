@@ -1,8 +1,9 @@
 """``shepherd-phys tune``: search the lengths of a heuristic team, on tuning seeds alone.
 
-Optuna's TPE sampler proposes; candidates meet in rounds. In a round all play the same few episodes, the better half
-plays on, and so forth. Every episode is kept in a ledger, and everything else follows from the seed: a search that was
-stopped continues with the same command.
+Candidates meet in rounds: half of them proposed by Optuna's TPE sampler, half near the best so far (at first: the
+values that stand in the code), with a few lengths moved by a step or two. In a round all play the same few episodes,
+the better half plays on, and so forth. Every episode is kept in a ledger, and everything else follows from the seed: a
+search that was stopped continues with the same command.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from .evaluate import cpu_count, progress_bar
 PROG = "shepherd-phys tune"
 
 Space = dict[str, tuple[float, float, float]]
-"""Least, largest, step of each length that is searched."""
+"""Of each length that is searched: least, largest, what a step to a value beside it is."""
 
 TEAM: Space = {
     "stop_distance": (0.0, 3.0, 0.5),
@@ -103,8 +104,10 @@ SECOND = 0.1
 TUNING_SEEDS = 10_000
 """Root seeds below this are for tuning."""
 
-DECIMALS = 6
-"""Values are rounded to what a person would write: 0.3 and not 0.30000000000000004."""
+MOVED, STEPS = 3, 2
+"""So many lengths of the best are moved for a candidate near it, by at most so many steps."""
+DECIMALS = 2
+"""Values are rounded to what a person would write."""
 
 Candidate = dict[str, float]
 
@@ -184,17 +187,19 @@ def search(options: Tune, ledger: Ledger) -> Path:
         ),
     )
     start = standing(name)
-    study.enqueue_trial(start)
+    rng = np.random.default_rng(options.seed)
+    best = start
     found: dict[tuple[tuple[str, float], ...], list[float]] = {}
+    order: list[tuple[tuple[str, float], ...]] = []
     for number in range(options.rounds):
+        for i in range((options.candidates + 1) // 2):
+            study.enqueue_trial(start if number == 0 and i == 0 else near(best, space, rng))
         asked = [study.ask() for _ in range(options.candidates)]
         field = [
-            {
-                key: round(trial.suggest_float(key, low, high, step=step), DECIMALS)
-                for key, (low, high, step) in space.items()
-            }
+            {key: round(trial.suggest_float(key, low, high), DECIMALS) for key, (low, high, _) in space.items()}
             for trial in asked
         ]
+        field[0] = start if number == 0 else field[0]  # not rounded
         racing, first = list(range(len(field))), 0
         results: list[list[float]] = [[] for _ in field]
         for heat, trials in enumerate(ROUND):
@@ -208,10 +213,10 @@ def search(options: Tune, ledger: Ledger) -> Path:
         for i, trial in enumerate(asked):
             study.tell(trial, float(np.mean(results[i])))
             found[tuple(field[i].items())] = results[i]
-        best = max(results, key=lambda r: (len(r), np.mean(r)))
-        print(f"{PROG}: round {number + 1} of {options.rounds}: best {np.mean(best):.2f}", flush=True)
-    # who played more episodes has beaten others to get there
-    order = sorted(found, key=lambda key: (-len(found[key]), -float(np.mean(found[key]))))
+        # who played more episodes has beaten others to get there
+        order = sorted(found, key=lambda key: (-len(found[key]), -float(np.mean(found[key]))))
+        best = dict(order[0])
+        print(f"{PROG}: round {number + 1} of {options.rounds}: best {np.mean(found[order[0]]):.2f}", flush=True)
     finalists = [dict(key) for key in order[:FINALISTS] if dict(key) != start] + [start]
     first = sum(ROUND)
     seeds = [trial_seed(options.seed, trial) for trial in range(first, first + CONFIRM)]
@@ -231,6 +236,16 @@ def search(options: Tune, ledger: Ledger) -> Path:
     path = options.out / f"{name}.toml"
     write_toml(record, path)
     return path
+
+
+def near(best: Candidate, space: Space, rng: np.random.Generator) -> Candidate:
+    """A candidate beside the best: a few lengths moved by a step or two, within what is searched."""
+    moved = dict(best)
+    for key in rng.choice(sorted(space), min(MOVED, len(space)), replace=False).tolist():
+        low, high, step = space[key]
+        ahead = moved[key] + step * int(rng.choice([-STEPS, -1, 1, STEPS]))
+        moved[key] = round(min(max(ahead, low), high), DECIMALS)
+    return moved
 
 
 def standing(name: str) -> Candidate:

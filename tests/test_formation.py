@@ -22,9 +22,9 @@ def flocks(*places):
 def test_sub_flocks_not_home_soonest_done_first_and_crumbs_last():
     sheep = [*flocks([20, 0], [0, 12], [-5, 0]), [7, 7]]
     state = arranged(sheep, [[30, 0]])
-    assert [f[0].tolist() for f in flocks_out(state, 3.0, 5.5)] == [[7, 7], [0, 12], [20, 0]]
-    assert [f[0].tolist() for f in flocks_out(state, 3.0, 5.5, crumb=0.2)] == [[0, 12], [20, 0], [7, 7]]
-    assert flocks_out(state, 3.0, 25.0, crumb=0.2) == []
+    assert [f[0].tolist() for f in flocks_out(state, 3.0, 5.5).sheep] == [[7, 7], [0, 12], [20, 0]]
+    assert [f[0].tolist() for f in flocks_out(state, 3.0, 5.5, crumb=0.2).sheep] == [[0, 12], [20, 0], [7, 7]]
+    assert flocks_out(state, 3.0, 25.0, crumb=0.2).sheep == []
 
 
 def test_a_team_keeps_to_its_sub_flock_until_another_is_much_sooner_done():
