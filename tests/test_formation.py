@@ -8,8 +8,9 @@ from shepherd_phys.controllers import CONTROLLERS
 from shepherd_phys.controllers.formation import Surroundings, beyond, flocks_out, in_order, leak_places
 from shepherd_phys.controllers.strombom import StrombomTeam
 from shepherd_phys.envs import ShepherdingEnv
-from shepherd_phys.obstacles import Pillar
+from shepherd_phys.obstacles import Pillar, Wall
 from shepherd_phys.scenario import Scenario
+from shepherd_phys.world import World
 
 TUNED = ("strombom", "pierson", "elfiqi", "occlusion")
 
@@ -81,3 +82,24 @@ def test_every_tuned_team_delivers_two_flocks_and_holds_them(name, n_shepherds):
     for _ in range(1000):
         observation, *_, info = env.step(controller.act(observation, env.state))
     assert info["in_goal"] > 0.9
+
+
+WALLED = (Wall((-15.0, 0.0), (-4.0, 0.0)), Wall((4.0, 0.0), (15.0, 0.0)), Wall((0.0, 6.0), (0.0, 18.0)))
+
+
+@pytest.mark.parametrize("name", TUNED)
+def test_every_tuned_team_walks_and_leads_its_flock_round_walls(name):
+    world = World(Scenario(n_sheep=40, n_flocks=1, obstacles=WALLED))
+    drawn = world.reset(0)
+    # the goal is on one side of the first wall, flock and shepherds are on the other
+    flock = drawn.sheep_pos - drawn.sheep_pos.mean(axis=0) + (-9.5, -8.0)
+    start = drawn.but(goal_pos=(-10.0, 10.0), sheep_pos=flock, shepherd_pos=[(-20, -10), (-14, 4), (-8, 15)])
+    state = world.reset_to(start, seed=1)
+    controller = CONTROLLERS[name]()
+    controller.reset(world.user_rng)
+    surfaces, nearest = Surroundings().of(WALLED), np.inf
+    for _ in range(700):
+        state = world.step(controller.act(NOTHING, state))
+        nearest = min(nearest, surfaces.static_distances(state.shepherd_pos)[0].min())
+    assert state.sheep_in_goal.mean() >= 0.95
+    assert nearest > 0.25  # the radius of a shepherd: none touched a wall
