@@ -60,15 +60,32 @@ class ElfiqiSettings(TeamSettings):
     """R1 + R2 behind the centroid."""
 
 
+TUNED = ElfiqiSettings(
+    stop_distance=2.5,
+    link=2.5,
+    let_go=3.5,
+    ring=10.5,
+    ring_out=12.0,
+    crumb=0.7,
+    loyalty=4.0,
+    berth=9.5,
+    flock_radius=5.0,
+    collect_standoff=4.0,
+    drive_distance=9.0,
+)
+"""What the team plays with. Found by ``shepherd-phys tune --controller elfiqi --rounds 4 --candidates 8 --seed 0``,
+version 0.1.0; the record is docs/tuning/elfiqi.toml."""
+
+
 class Elfiqi(Team):
     """The tuned team: one sub-flock at a time, a terminal rule.
 
     Args:
-        settings: its lengths.
+        settings: its lengths; `TUNED` unless given.
     """
 
     def __init__(self, settings: ElfiqiSettings | None = None) -> None:
-        self.settings = settings or ElfiqiSettings()
+        self.settings = settings or TUNED
         super().__init__(self.settings)
 
     def _targets(self, state: WorldState, flocks: SubFlocks) -> Floats:

@@ -33,10 +33,7 @@ from .formation import SubFlocks, Team, TeamSettings, walk
 
 @settings
 class StrombomSettings(TeamSettings):
-    """Lengths in metres, angles in radians; symbols of the 2014 paper.
-
-    The defaults were tuned by hand on a few episodes of the tuning seeds (three shepherds, one and two flocks).
-    """
+    """Lengths in metres, angles in radians; symbols of the 2014 paper."""
 
     collect_standoff: float = Field(default=4.0, gt=0)
     """Behind an outlier; r_a in the paper."""
@@ -48,15 +45,33 @@ class StrombomSettings(TeamSettings):
     """Between neighbouring shepherds of the V (Fujioka 2018)."""
 
 
+TUNED = StrombomSettings(
+    stop_distance=1.54,
+    link=4.7,
+    let_go=4.22,
+    ring=10.56,
+    ring_out=12.04,
+    crumb=0.63,
+    loyalty=4.18,
+    berth=8.33,
+    collect_standoff=2.99,
+    drive_standoff=8.69,
+    flock_radius=5.3,
+    v_angle=0.46,
+)
+"""What the team plays with. Found by ``shepherd-phys tune --controller strombom --rounds 4 --candidates 8 --seed 0``,
+version 0.1.0; the record is docs/tuning/strombom.toml."""
+
+
 class StrombomTeam(Team):
     """The tuned team: sub-flock by sub-flock, own stand-offs, a terminal rule.
 
     Args:
-        settings: its lengths.
+        settings: its lengths; `TUNED` unless given.
     """
 
     def __init__(self, settings: StrombomSettings | None = None) -> None:
-        self.settings = settings or StrombomSettings()
+        self.settings = settings or TUNED
         super().__init__(self.settings)
 
     def _targets(self, state: WorldState, flocks: SubFlocks) -> Floats:

@@ -1,9 +1,9 @@
 """``shepherd-phys tune``: search the lengths of a heuristic team, on tuning seeds alone.
 
 Candidates meet in rounds: half of them proposed by Optuna's TPE sampler, half near the best so far (at first: the
-values that stand in the code), with a few lengths moved by a step or two. In a round all play the same few episodes,
-the better half plays on, and so forth. Every episode is kept in a ledger, and everything else follows from the seed: a
-search that was stopped continues with the same command.
+values set by hand, the settings' defaults), with a few lengths moved by a step or two. In a round all play the same
+few episodes, the better half plays on, and so forth. Every episode is kept in a ledger, and everything else follows
+from the seed: a search that was stopped continues with the same command.
 """
 
 from __future__ import annotations
@@ -22,12 +22,9 @@ import tyro
 
 from shepherd_phys import __version__, campaign
 from shepherd_phys.campaign import CampaignError, Ledger, settings_hash
-from shepherd_phys.controllers.elfiqi import Elfiqi, ElfiqiSettings
+from shepherd_phys.controllers import elfiqi, occlusion, pierson, strombom
 from shepherd_phys.controllers.evaluation import evaluate, trial_seed
 from shepherd_phys.controllers.formation import Team, TeamSettings
-from shepherd_phys.controllers.occlusion import Occlusion, OcclusionSettings
-from shepherd_phys.controllers.pierson import Pierson, PiersonSettings
-from shepherd_phys.controllers.strombom import StrombomSettings, StrombomTeam
 from shepherd_phys.envs.shepherding import ShepherdingEnv
 from shepherd_phys.scenario import SCENARIOS, Scenario
 from shepherd_phys.settings import SettingsError, write_toml
@@ -51,10 +48,10 @@ TEAM: Space = {
 }
 """What all teams share (`TeamSettings`)."""
 
-TEAMS: dict[str, tuple[Callable[[Any], Team], type[TeamSettings], Space]] = {
+TEAMS: dict[str, tuple[Callable[[Any], Team], TeamSettings, Space]] = {
     "strombom": (
-        StrombomTeam,
-        StrombomSettings,
+        strombom.StrombomTeam,
+        strombom.TUNED,
         {
             "collect_standoff": (2.0, 7.0, 0.5),
             "drive_standoff": (5.0, 10.0, 0.5),
@@ -63,8 +60,8 @@ TEAMS: dict[str, tuple[Callable[[Any], Team], type[TeamSettings], Space]] = {
         },
     ),
     "pierson": (
-        Pierson,
-        PiersonSettings,
+        pierson.Pierson,
+        pierson.TUNED,
         {
             "gain": (0.05, 0.5, 0.05),
             "min_push": (0.3, 1.0, 0.1),
@@ -75,8 +72,8 @@ TEAMS: dict[str, tuple[Callable[[Any], Team], type[TeamSettings], Space]] = {
         },
     ),
     "elfiqi": (
-        Elfiqi,
-        ElfiqiSettings,
+        elfiqi.Elfiqi,
+        elfiqi.TUNED,
         {
             "flock_radius": (2.0, 8.0, 0.5),
             "collect_standoff": (2.0, 7.0, 0.5),
@@ -84,12 +81,12 @@ TEAMS: dict[str, tuple[Callable[[Any], Team], type[TeamSettings], Space]] = {
         },
     ),
     "occlusion": (
-        Occlusion,
-        OcclusionSettings,
+        occlusion.Occlusion,
+        occlusion.TUNED,
         {"approach": (1.0, 7.0, 0.5), "circle": (4.0, 10.0, 0.5), "min_radius": (0.5, 3.0, 0.5)},
     ),
 }
-"""Who can be tuned: how the team is made, its settings, what is searched beside `TEAM`."""
+"""Who can be tuned: how the team is made, the settings that it has, what is searched beside `TEAM`."""
 
 POINTS = ((1, 40, 3), (2, 40, 3), (3, 40, 3), (5, 40, 3), (2, 10, 3), (2, 40, 1), (2, 40, 2), (2, 40, 6))
 """Where every candidate plays: flocks, neighbours n, shepherds."""
@@ -98,7 +95,7 @@ ROUND = (1, 1, 2, 4)
 CONFIRM = 8
 """Trials a point, met by nobody before, on which the finalists are compared."""
 FINALISTS = 2
-"""How many of the best meet the values that stand in the code."""
+"""How many of the best meet the values set by hand."""
 SECOND = 0.1
 """What a second until 95 % are in costs, in percent of the sheep in the goal at the end."""
 TUNING_SEEDS = 10_000
@@ -116,8 +113,8 @@ Candidate = dict[str, float]
 class Tune:
     """Search the lengths of a tuned heuristic team on tuning seeds, and write down the best and how it was found.
 
-    Writes NAME.toml into the folder --out: the values, the score of the best and of the values that stand in the code
-    on seeds that the search has not seen, the command and the version.
+    Writes NAME.toml into the folder --out: the values, the score of the best and of the values set by hand on seeds
+    that the search has not seen, the command and the version.
     """
 
     controller: Annotated[str, tyro.conf.arg(metavar="|".join(TEAMS))] = "strombom"
@@ -186,7 +183,7 @@ def search(options: Tune, ledger: Ledger) -> Path:
             seed=options.seed, n_startup_trials=2 * options.candidates, multivariate=True
         ),
     )
-    start = standing(name)
+    start = lengths(type(TEAMS[name][1])(), space)
     rng = np.random.default_rng(options.seed)
     best = start
     found: dict[tuple[tuple[str, float], ...], list[float]] = {}
@@ -248,11 +245,10 @@ def near(best: Candidate, space: Space, rng: np.random.Generator) -> Candidate:
     return moved
 
 
-def standing(name: str) -> Candidate:
-    """The values that stand in the code."""
-    _, settings, own = TEAMS[name]
-    values = settings().to_dict()
-    return {key: float(values[key]) for key in (*TEAM, *own)}
+def lengths(settings: TeamSettings, space: Space) -> Candidate:
+    """What is searched of a team's settings."""
+    values = settings.to_dict()
+    return {key: float(values[key]) for key in space}
 
 
 def scored(
@@ -284,7 +280,7 @@ def episode(spec: tuple[str, Candidate, tuple[int, int, int]], seed: int) -> dic
     """Run one episode of a candidate: the work of the campaign."""
     name, values, point = spec
     team, settings, _ = TEAMS[name]
-    row = evaluate(team(settings().but(**values)), partial(ShepherdingEnv, scenario_of(*point)), [seed])[0]
+    row = evaluate(team(settings.but(**values)), partial(ShepherdingEnv, scenario_of(*point)), [seed])[0]
     return {"score": row["in_goal_end"] - SECOND * row["time_to_95"]}
 
 
