@@ -1,0 +1,272 @@
+"""``shepherd-phys reproduce``: the paper's experiments, their figures, and what they say to its claims."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import io
+import json
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, TextIO
+
+import tyro
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from shepherd_phys import __version__, campaign
+from shepherd_phys.campaign import CampaignError, Ledger, Outcome, Task, write_csv
+from shepherd_phys.controllers import CONTROLLERS
+from shepherd_phys.controllers.claims import EXPERIMENTS, HEURISTICS, LEARNED, LITERAL, judge
+from shepherd_phys.controllers.evaluation import COLUMNS, ControllerError, trial_seed
+from shepherd_phys.controllers.summary import summarise, summary_columns
+from shepherd_phys.settings import SettingsError
+
+from .evaluate import WANTED, _flag, _one_line, cpu_count, print_table, progress_bar, ready
+from .pages import PART_HEAD, claims_page, few_trials, figure_page, part_cells
+from .points import episode, points, table, tasks
+
+PROG = "shepherd-phys reproduce"
+SCENARIO = "paper"
+CHOICES = (*EXPERIMENTS, "all")
+
+
+@dataclass(frozen=True)
+class Reproduce:
+    """Run the paper's experiments with every method that there is, draw its figures, and judge its claims.
+
+    Writes into the folder --out, for each figure, its CSV, Markdown tables and drawing; claims.json and claims.md;
+    episodes.csv; and a ledger that lets a stopped run continue: give the same command again.
+    """
+
+    figure: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="|".join(CHOICES))]
+    """Which of the paper's figures; a point that two of them share is run once."""
+    literal: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Add the heuristics as published: strombom-literal, pierson-reconstructed, elfiqi-literal."""
+    controllers: Annotated[tuple[str, ...], _flag("NAME ..", "all tuned heuristics and shipped policies")] = ()
+    """Only these, by name or module:Name of your own; claims on others stay undecided."""
+    trials: Annotated[int, _flag("T")] = 100
+    """Episodes a point."""
+    seed: Annotated[int, _flag("S")] = 20_000
+    """Root seed: trial i has a seed derived from S and i alone, the same for every controller and point."""
+    workers: Annotated[int, _flag("W")] = cpu_count()
+    """Worker processes; the results do not depend on it."""
+    timeout: Annotated[float, _flag("SECONDS")] = 600.0
+    """An episode that takes longer counts as hung."""
+    out: Annotated[Path, _flag("DIR")] = Path("results/reproduce")
+    """Folder for tables, figures and ledger; an unfinished run in it is continued."""
+    json: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Print one JSON object, the rows of each figure and the claims, and nothing else, on standard output."""
+
+
+LEAST = {"trials": 1, "seed": 0, "workers": 1}
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run the command; the exit status: 0, 1 if episodes failed, 2 for a mistake of the user, 130 for Ctrl-C."""
+    try:
+        options = read_options(argv)
+    except SettingsError as error:
+        return _fail(error, 2)
+    out = sys.stdout
+    with contextlib.redirect_stdout(sys.stderr):  # a user's classes may print wherever they are touched
+        return _main(options, out)
+
+
+def _main(options: Reproduce, out: TextIO) -> int:
+    asked = list(EXPERIMENTS) if options.figure == "all" else [options.figure]
+    methods = roster(options.controllers, options.literal)
+    seeds = [trial_seed(options.seed, trial) for trial in range(options.trials)]
+    try:
+        check_drawing()
+        todo, everything = work(asked, methods, seeds), work(list(EXPERIMENTS), methods, seeds)
+    except (SettingsError, ControllerError) as error:
+        return _fail(error, 2)
+    with progress_bar() as report:
+        try:
+            ledger = ready(options.out, todo)
+        except (SettingsError, CampaignError) as error:
+            return _fail(error, 2)
+        with ledger:
+            try:
+                outcome = campaign.run(
+                    todo, episode, workers=options.workers, ledger=ledger, timeout=options.timeout, report=report
+                )
+                rows = table(everything, kept(ledger, everything))
+                summaries = {name: summary_of(name, rows, methods) for name in asked}
+                claims = {
+                    "trials": options.trials,
+                    "seed": options.seed,
+                    "version": __version__,
+                    "claims": [claim.to_dict() for claim in judge(rows, seeds)],
+                }
+                paths = write_files(options.out, rows, summaries, claims)
+            except CampaignError as error:
+                return _fail(error, 1)
+            except KeyboardInterrupt:
+                return _fail(f"stopped; what was finished is kept in {ledger.path}: the same command continues", 130)
+    if options.json:
+        print(json.dumps({**summaries, "claims": claims}, allow_nan=False, indent=1), file=out)
+    else:
+        for summary in summaries.values():
+            print_table(summary, out)
+        print_claims(claims, out)
+    for path in paths:
+        print(path, file=sys.stderr if options.json else out)
+    for failure in outcome.failures:
+        print(f"{PROG}: no result in {failure.attempts} attempts: {failure}", file=sys.stderr)
+    return 1 if outcome.failures else 0
+
+
+def roster(controllers: Sequence[str], literal: bool) -> list[str]:
+    """The methods to compare: those asked for, or the tuned heuristics and the policies as far as they exist."""
+    known = [name for name in (*HEURISTICS, *LEARNED) if name in CONTROLLERS]
+    return list(dict.fromkeys([*(controllers or known), *(LITERAL if literal else ())]))
+
+
+def work(names: Sequence[str], controllers: Sequence[str], seeds: Sequence[int]) -> list[Task]:
+    """The tasks of some experiments; a point that two of them share comes once.
+
+    Raises:
+        SettingsError, ControllerError: a controller is unknown or none.
+    """
+    grid = [
+        point
+        for experiment in (EXPERIMENTS[name] for name in names)
+        for point in points(
+            controllers=controllers, scenario=SCENARIO, flocks=experiment.flocks, cohesion=experiment.cohesion
+        )
+    ]
+    return list({task.key: task for task in tasks(grid, seeds)}.values())
+
+
+def kept(ledger: Ledger, tasks: Sequence[Task]) -> Outcome:
+    """What the ledger holds of the tasks, of earlier runs for another figure too."""
+    rows = ledger.rows(task.settings_hash for task in tasks)
+    return Outcome(rows=[rows.get(task.key) for task in tasks], failures=[], computed=0)
+
+
+def summary_of(name: str, rows: Sequence[Mapping[str, Any]], methods: Sequence[str]) -> list[dict[str, Any]]:
+    """The rows of an experiment's CSV: method by method."""
+    there = EXPERIMENTS[name].points
+    summary = summarise(row for row in rows if (row["n_flocks"], row["cohesion"]) in there)
+    return sorted(summary, key=lambda row: (methods.index(row["controller"]), row["n_flocks"], row["cohesion"]))
+
+
+def check_drawing() -> None:
+    """Find out before hours of computing whether figures can be drawn.
+
+    Raises:
+        SettingsError: matplotlib is missing.
+    """
+    try:
+        importlib.import_module("matplotlib")
+    except ImportError as error:
+        raise SettingsError(f"the figures need matplotlib: pip install 'shepherd-phys[analysis]' ({error})") from None
+
+
+def write_files(
+    folder: Path,
+    rows: Sequence[Mapping[str, Any]],
+    summaries: Mapping[str, Sequence[Mapping[str, Any]]],
+    claims: Mapping[str, Any],
+) -> list[Path]:
+    """Write every table, page and figure; their paths.
+
+    Raises:
+        CampaignError: one cannot be written. It is as it was before.
+    """
+    from .figures import draw
+
+    episodes = folder / "episodes.csv"
+    write_csv(episodes, COLUMNS, rows)
+    paths = [episodes]
+    for name, summary in summaries.items():
+        if not summary:
+            continue  # every episode failed, which is reported
+        paths.append(folder / f"{name}.csv")
+        write_csv(paths[-1], summary_columns(), summary)
+        paths.append(write_whole(folder / f"{name}.md", figure_page(name, summary).encode()))
+        paths.append(write_whole(folder / f"{name}.png", draw(EXPERIMENTS[name], summary)))
+    text = json.dumps(claims, allow_nan=False, indent=1, ensure_ascii=False)
+    paths.append(write_whole(folder / "claims.json", f"{text}\n".encode()))
+    paths.append(write_whole(folder / "claims.md", claims_page(claims).encode()))
+    return paths
+
+
+def write_whole(path: Path, content: bytes) -> Path:
+    """Write a file, which appears whole or not at all; its path.
+
+    Raises:
+        CampaignError: it cannot be written.
+    """
+    part = path.with_name(path.name + ".part")
+    try:
+        with part.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(part, path)
+    except OSError as error:
+        raise CampaignError(
+            f"{path}: cannot be written ({error.strerror}); no episode is lost: the same run writes it again"
+        ) from None
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink()
+    return path
+
+
+def print_claims(claims: Mapping[str, Any], out: TextIO) -> None:
+    """Print what each claim rests on, then the verdicts."""
+    parts = Table(*("claim", *PART_HEAD), box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    verdicts = Table("claim", "says", "verdict", box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    for claim in claims["claims"]:
+        for part in claim["parts"]:
+            parts.add_row(claim["claim"], *part_cells(part))
+        verdicts.add_row(claim["claim"], claim["text"], claim["verdict"])
+    console = Console(file=out, markup=False, highlight=False)
+    if not console.is_terminal:
+        console.width = 200  # a file has no edge to wrap at
+    console.print(parts)
+    console.print(verdicts)
+    for line in few_trials(claims):
+        console.print(line)
+
+
+def read_options(argv: Sequence[str]) -> Reproduce:
+    """The options from the command line, checked.
+
+    Raises:
+        SettingsError: something is unknown or impossible.
+        SystemExit: after ``--help``.
+    """
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            options = tyro.cli(Reproduce, prog=PROG, args=list(argv))
+    except SystemExit as end:
+        if not end.code:
+            raise
+        problem = _one_line(said.getvalue())
+        wanted = [f"; --{name} takes {what}" for name, what in WANTED.items() if f"--{name}" in problem]
+        raise SettingsError(f"{problem}{''.join(wanted[:1])} (see {PROG} --help)") from None
+    if options.figure not in CHOICES:
+        raise SettingsError(f"figure: {options.figure!r} is unknown; there are {', '.join(CHOICES)}")
+    if not options.controllers and any(word.split("=")[0] == "--controllers" for word in argv):
+        raise SettingsError("--controllers: needs at least one value")
+    for name, least in LEAST.items():
+        if getattr(options, name) < least:
+            raise SettingsError(f"{name}: {getattr(options, name)} is impossible; it must be at least {least}")
+    if not options.timeout > 0:
+        raise SettingsError(f"timeout: {options.timeout} is impossible; it must be above 0 s")
+    return options
+
+
+def _fail(error: object, status: int) -> int:
+    print(f"{PROG}: {' '.join(str(error).split())}", file=sys.stderr)
+    return status
