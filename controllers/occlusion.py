@@ -39,15 +39,32 @@ class OcclusionSettings(TeamSettings):
     """Least R_c."""
 
 
+TUNED = OcclusionSettings(
+    stop_distance=2.0,
+    link=2.0,
+    let_go=4.0,
+    ring=10.5,
+    ring_out=12.0,
+    crumb=0.7,
+    loyalty=2.0,
+    berth=9.0,
+    approach=4.0,
+    circle=8.0,
+    min_radius=0.5,
+)
+"""What the team plays with. Found by ``shepherd-phys tune --controller occlusion --rounds 4 --candidates 8 --seed 0``,
+version 0.1.0; the record is docs/tuning/occlusion.toml."""
+
+
 class Occlusion(Team):
     """The team: a sub-flock for each shepherd, a terminal rule.
 
     Args:
-        settings: its lengths.
+        settings: its lengths; `TUNED` unless given.
     """
 
     def __init__(self, settings: OcclusionSettings | None = None) -> None:
-        self.settings = settings or OcclusionSettings()
+        self.settings = settings or TUNED
         super().__init__(self.settings)
 
     def _targets(self, state: WorldState, flocks: SubFlocks) -> Floats:
