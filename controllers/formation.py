@@ -31,6 +31,9 @@ from .routes import Routes
 WEDGE = 0.35
 """How far ahead along the edge of a disc a shepherd aims that walks round it [rad]."""
 
+MEETING, AHEAD, ASIDE = 1.0, 0.5, 1.2
+"""A shepherd steps aside, by an angle [rad], for one nearer than this [m] whose direction has this cosine with its own."""
+
 
 @settings
 class TeamSettings(Settings):
@@ -96,7 +99,7 @@ class Team:
                 self._routes = geometry, Routes(geometry, s.clearance), Routes(geometry, s.flock_clearance)
         targets, stop = self._wanted(state)
         if state.obstacles and self._routes is not None:
-            targets = self._routes[1].towards(state.shepherd_pos, targets)
+            targets = make_way(state.shepherd_pos, self._routes[1].towards(state.shepherd_pos, targets))
         return walk(state, targets, stop, s.noise, self._rng)
 
     def _wanted(self, state: WorldState) -> tuple[Floats, float]:
@@ -340,6 +343,28 @@ def round_about(pos, targets, center, radius):  # type: ignore[no-untyped-def]
             bearing = here + min(max(turn, -WEDGE), WEDGE)
             places[k, 0] = center[0] + edge * math.cos(bearing)
             places[k, 1] = center[1] + edge * math.sin(bearing)
+    return places
+
+
+@njit(cache=True)
+def make_way(pos, targets):  # type: ignore[no-untyped-def]
+    """Next places (P, 2) to walk to, for one that has another right before it to the right of that one [m].
+
+    In the open teams are given places so that nobody crosses another's way; between obstacles two may meet head-on, and
+    would block each other for ever.
+    """
+    places = targets.copy()
+    cos, sin = math.cos(ASIDE), math.sin(ASIDE)
+    for k in range(len(pos)):
+        x, y = targets[k, 0] - pos[k, 0], targets[k, 1] - pos[k, 1]
+        length = math.hypot(x, y)
+        for j in range(len(pos)):
+            dx, dy = pos[j, 0] - pos[k, 0], pos[j, 1] - pos[k, 1]
+            away = math.hypot(dx, dy)
+            if j != k and 0 < away < min(MEETING, length) and x * dx + y * dy > AHEAD * away * length:
+                places[k, 0] = pos[k, 0] + (cos * x + sin * y) / length
+                places[k, 1] = pos[k, 1] + (cos * y - sin * x) / length
+                break
     return places
 
 

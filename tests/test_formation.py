@@ -5,7 +5,7 @@ import pytest
 from scenes import NOTHING, arranged
 
 from shepherd_phys.controllers import CONTROLLERS
-from shepherd_phys.controllers.formation import Surroundings, beyond, flocks_out, in_order, leak_places
+from shepherd_phys.controllers.formation import Surroundings, beyond, flocks_out, in_order, leak_places, make_way
 from shepherd_phys.controllers.strombom import StrombomTeam
 from shepherd_phys.envs import ShepherdingEnv
 from shepherd_phys.obstacles import Pillar, Wall
@@ -82,6 +82,18 @@ def test_every_tuned_team_delivers_two_flocks_and_holds_them(name, n_shepherds):
     for _ in range(1000):
         observation, *_, info = env.step(controller.act(observation, env.state))
     assert info["in_goal"] > 0.9
+
+
+def test_two_that_meet_head_on_both_step_to_their_right():
+    pos, targets = np.array([[0.0, 0.0], [0.6, 0.0], [0.3, 5.0]]), np.array([[5.0, 0.0], [-5.0, 0.0], [0.3, 9.0]])
+    aside = make_way(pos, targets)
+    assert aside[0] == pytest.approx([np.cos(1.2), -np.sin(1.2)])
+    assert aside[1] == pytest.approx([0.6 - np.cos(1.2), np.sin(1.2)])
+    assert aside[2].tolist() == [0.3, 9.0]
+    behind = make_way(pos[:2], np.array([[5.0, 0.0], [5.0, 0.0]]))
+    assert behind[1].tolist() == [5.0, 0.0]  # who is in front goes on
+    arrived = make_way(pos[:2], pos[:2])
+    assert arrived.tolist() == pos[:2].tolist()
 
 
 WALLED = (Wall((-15.0, 0.0), (-4.0, 0.0)), Wall((4.0, 0.0), (15.0, 0.0)), Wall((0.0, 6.0), (0.0, 18.0)))
