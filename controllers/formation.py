@@ -32,7 +32,7 @@ WEDGE = 0.35
 """How far ahead along the edge of a disc a shepherd aims that walks round it [rad]."""
 
 MEETING, AHEAD, ASIDE = 1.0, 0.5, 1.2
-"""A shepherd steps aside for one nearer than this [m], in a direction with this cosine to its own; by how much [rad]."""
+"""A shepherd steps aside for one nearer than this [m], in a direction with this cosine to its, by this much [rad]."""
 
 
 @settings
