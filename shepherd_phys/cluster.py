@@ -91,6 +91,7 @@ class Cluster:
         self._say = say
         self._client: Any = None
         self._sites: dict[str, _Site] = {}
+        self._restarting: set[str] = set()
         self._homeless: deque[_Sent] = deque()
         self._news: queue.SimpleQueue[tuple[_Site, _Sent | None, Any]] = queue.SimpleQueue()
         self._looked = 0.0
@@ -201,6 +202,8 @@ class Cluster:
         gone = [site for address, site in self._sites.items() if address not in seen["workers"]]
         ended = [end for site in gone for end in self._bury(site)]
         for address, worker in seen["workers"].items():
+            if address in self._restarting:
+                continue
             if address not in self._sites:
                 site = self._sites[address] = _Site(address, max(1, worker["nthreads"]), late)
                 site.greeting = self._submit(site, None, _greeting(), self._work)
@@ -228,9 +231,19 @@ class Cluster:
             ]
             self._leave(site, [sent for sent in site.sent if sent.deadline > now])
         if hanging:
-            with suppress(Exception):  # then it is greeted again, and does not answer until it can
-                self._client.restart_workers([s.address for s in hanging], RESTART_SECONDS, raise_for_error=False)
+            self._restart({site.address for site in hanging})
         return ended
+
+    def _restart(self, addresses: set[str]) -> None:
+        """Have workers' processes ended, and begun anew where a nanny does that; it takes seconds."""
+        self._restarting |= addresses
+
+        def restart() -> None:
+            with suppress(Exception):  # then they are greeted again, and answer when they can
+                self._client.restart_workers(list(addresses), RESTART_SECONDS, raise_for_error=False)
+            self._restarting -= addresses
+
+        threading.Thread(target=restart, daemon=True).start()
 
     def _leave(self, site: _Site, innocent: list[_Sent]) -> None:
         """Give up a worker; jobs that lost nothing by it look for another."""
@@ -257,11 +270,15 @@ class Cluster:
             retries=0,
             fifo_timeout=0,
         )
-        future.add_done_callback(partial(self._fetch, site, sent))
+        future.add_done_callback(partial(self._done, site, sent))
         return future
 
+    def _done(self, site: _Site, sent: _Sent | None, future: Any) -> None:
+        # Dask has one thread for all callbacks, and what a worker did that has died since may be looked for half a
+        # minute: nobody else should wait for that
+        threading.Thread(target=self._fetch, args=(site, sent, future), daemon=True).start()
+
     def _fetch(self, site: _Site, sent: _Sent | None, future: Any) -> None:
-        """In a thread of Dask's."""
         try:
             result = future.result()
         except BaseException as error:
