@@ -29,6 +29,8 @@ CONNECT_SECONDS = 10.0
 """A scheduler that has not answered by then is not there [s]."""
 LOOK_SECONDS = 1.0
 """Workers that come and go are noticed within this time [s]."""
+LOST_SECONDS = 60.0
+"""A scheduler that does not answer for so long is lost, even if its machine still holds the connection [s]."""
 RESTART_SECONDS = 20.0
 """For the restart of a hanging worker [s]."""
 PATIENCE_SECONDS = 15.0
@@ -39,10 +41,10 @@ QUEUE = 1
 
 @dataclass(eq=False)
 class _Sent:
-    """A job, and how long it may still take."""
+    """A job, and until when it may take."""
 
     job: Job
-    work: bytes
+    pickled: bytes
     future: Any = None
     deadline: float = float("inf")
 
@@ -195,7 +197,7 @@ class Cluster:
     def _look(self, late: bool) -> list[Ended]:
         """Notice workers that came and went; the jobs that went with them."""
         try:
-            seen = self._client.sync(self._client.scheduler.identity, n_workers=-1, callback_timeout=CONNECT_SECONDS)
+            seen = self._client.sync(self._client.scheduler.identity, n_workers=-1, callback_timeout=LOST_SECONDS)
         except Exception:
             raise self._lost() from None
         self._looked = time.monotonic()
@@ -256,7 +258,7 @@ class Cluster:
     def _send(self, sent: _Sent) -> None:
         site = max(self._sites.values(), key=lambda site: site.room)
         site.sent.append(sent)
-        sent.future = self._submit(site, sent, _doing(), self._work, sent.work)
+        sent.future = self._submit(site, sent, _doing(), self._work, sent.pickled)
         self._start_clocks(site)
 
     def _submit(self, site: _Site, sent: _Sent | None, function: Any, *arguments: bytes) -> Any:
@@ -303,7 +305,8 @@ class Cluster:
             return
         text = ""
         if all(site.unfit for site in self._sites.values()):
-            text = f"scheduler {self._address} has no workers; waiting for one to join"
+            able = " that can do the work" if self._sites else ""
+            text = f"scheduler {self._address} has no workers{able}; waiting for one to join"
         elif now - self._idle_since > PATIENCE_SECONDS:
             text = f"none of the workers of {self._address} has answered yet; waiting"
         if text and text != self._said:
