@@ -1,6 +1,7 @@
 """``shepherd-phys evaluate`` from the outside: tables, JSON, continuing, shards, grids, and every mistake."""
 
 import csv
+import importlib.util
 import io
 import json
 import math
@@ -20,8 +21,8 @@ from shepherd_phys import __version__, campaign
 from shepherd_phys.bodies import Disc
 from shepherd_phys.campaign import Ledger
 from shepherd_phys.controllers.evaluation import COLUMNS, METRICS, trial_seed
-from shepherd_phys.controllers.summary import summary_columns
-from shepherd_phys.scripts import evaluate, main
+from shepherd_phys.controllers.summary import difference_columns, summary_columns
+from shepherd_phys.scripts import evaluate, main, pictures
 from shepherd_phys.scripts.evaluate import GRID_KEYS, LISTS, read_options, read_shard
 from shepherd_phys.scripts.points import points
 from shepherd_phys.settings import SettingsError
@@ -107,6 +108,13 @@ class Free:
     def velocities(self, state, rng): return np.zeros((state.n_sheep, 2))
 class Needy(Disc):
     def __init__(self, what): pass
+class Late(Chase):
+    def __init__(self): 1 / 0
+class Heavy(Disc):
+    def __init__(self, **values): raise RuntimeError("too heavy")
+class Wild:
+    def __init__(self): raise RuntimeError("too wild")
+def maker(): raise KeyError("no")
 number = 3
 """
 
@@ -156,7 +164,11 @@ def test_the_command_in_a_shell(folder):
         "--trials 2 --workers 2"
     )
     assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines()[-3:] == ["results/episodes.csv", "results/summary.csv", "results/episode.png"]
+    names = ["episodes.csv", "episodes.parquet", "summary.csv", "differences.csv", "episode.png"]
+    if not importlib.util.find_spec("polars"):
+        names.remove("episodes.parquet")
+    assert done.stdout.splitlines()[-len(names) :] == [f"results/{name}" for name in names]
+    assert "difference from idle on the same seeds" in done.stdout
     assert "in at the end %" in done.stdout
     rows = read("results/episodes.csv")
     assert tuple(rows[0]) == COLUMNS
@@ -184,6 +196,7 @@ def test_json_is_all_that_there_is_on_standard_output(folder):
         assert (row["n_flocks"], row["cohesion"], row["n_shepherds"], row["trials"]) == (2, 40, 2, 2)
         for name in METRICS:
             assert row[f"{name}_low"] <= row[f"{name}_mean"] <= row[f"{name}_high"]
+    assert [row["differences"] is None for row in rows] == [False, True]  # mine:Chase is the first
     assert "o/summary.csv" in done.stderr
 
 
@@ -205,7 +218,7 @@ def test_tables_do_not_depend_on_workers_order_or_interruption(folder, in_proces
     with Ledger("b", __version__) as ledger:  # as a run that was killed half-way leaves it
         ledger._rows.execute("DELETE FROM episodes WHERE seed = ?", (trial_seed(20_000, 1),))
     assert run("--controllers", "idle", "random", "--out", "b", workers=1) == 0
-    for name in ("episodes.csv", "summary.csv"):
+    for name in ("episodes.csv", "summary.csv", "differences.csv"):
         assert Path("a", name).read_bytes() == Path("b", name).read_bytes()
 
 
@@ -213,7 +226,7 @@ def test_a_finished_campaign_runs_nothing(folder, in_process, monkeypatch, capsy
     assert run("--controllers", "idle") == 0
     first = {path.name: path.read_bytes() for path in Path("results").iterdir()}
     monkeypatch.setattr("shepherd_phys.campaign.attempt", None)
-    monkeypatch.setattr("shepherd_phys.scripts.evaluate.draw_episode", None)
+    monkeypatch.setattr("shepherd_phys.scripts.pictures.draw_episode", None)
     assert run("--controllers", "idle") == 0
     assert {path.name: path.read_bytes() for path in Path("results").iterdir()} == first
     assert mistakes(capsys.readouterr().err) == []
@@ -297,6 +310,76 @@ def test_shards_make_up_the_whole(folder, in_process):
     assert sorted(parts, key=key) == read("whole/episodes.csv")
 
 
+def test_shards_gathered_are_the_whole(folder, in_process, monkeypatch):
+    words = ["--controllers", "idle", "random", "--trials", "3"]
+    assert run(*words, "--out", "whole") == 0
+    for i in "12":
+        assert run(*words, "--out", i, "--shard", f"{i}/2") == 0
+    monkeypatch.setattr("shepherd_phys.campaign.attempt", None)
+    assert run(*words, "--gather", "1", "2", "--out", "all") == 0
+    tables = [path.name for path in Path("whole").iterdir() if not path.name.startswith("ledger")]
+    assert {"episodes.csv", "summary.csv", "differences.csv"} <= set(tables)
+    for name in tables:
+        assert Path("all", name).read_bytes() == Path("whole", name).read_bytes()
+
+
+def test_differences_are_paired_with_the_baseline(folder, in_process, capsys):
+    words = ["--controllers", "idle", "random", "mine:Chase", "--flocks", "1", "2", "--json"]
+    assert run(*words, "--baseline", "random") == 0
+    rows = json.loads(capsys.readouterr().out)
+    episodes = {(row["controller"], row["n_flocks"], row["seed"]): row for row in read("results/episodes.csv")}
+    for row in rows:
+        told = row["differences"]
+        if row["controller"] == "random":
+            assert told is None
+            continue
+        assert (told["baseline"], told["trials"]) == ("random", 2)
+        by_hand = [
+            float(own["path_length"]) - float(episodes["random", flocks, seed]["path_length"])
+            for (name, flocks, seed), own in episodes.items()
+            if (name, flocks) == (row["controller"], str(row["n_flocks"]))
+        ]
+        assert told["path_length_diff_mean"] == pytest.approx(sum(by_hand) / 2)
+        assert told["path_length_diff_low"] <= told["path_length_diff_mean"] <= told["path_length_diff_high"]
+    table = read("results/differences.csv")
+    assert tuple(table[0]) == difference_columns()
+    assert [(row["controller"], row["n_flocks"], row["baseline"]) for row in table] == [
+        (name, flocks, "random") for name in ("idle", "mine:Chase") for flocks in "12"
+    ]
+
+
+def test_the_baseline_is_the_first_controller_and_pairs_share_seeds(folder, in_process, capsys):
+    assert run("--controllers", "random", "idle", "mine:Bad", "--shard", "1/2", "--trials", "3", "--json") == 1
+    rows = {row["controller"]: row for row in json.loads(capsys.readouterr().out)}
+    assert rows["idle"]["differences"]["baseline"] == "random"
+    seeds = {name: {row["seed"] for row in read("results/episodes.csv") if row["controller"] == name} for name in rows}
+    assert rows["idle"]["differences"]["trials"] == len(seeds["idle"] & seeds["random"])
+
+
+def test_tables_of_an_earlier_command_do_not_stay(folder, in_process, monkeypatch, capsys):
+    assert run("--controllers", "random", "idle") == 0
+    assert Path("results/differences.csv").exists()
+    monkeypatch.setitem(sys.modules, "polars", None)
+    capsys.readouterr()
+    assert run("--controllers", "idle") == 0
+    assert not Path("results/differences.csv").exists()
+    assert not Path("results/episodes.parquet").exists()
+    assert "difference" not in capsys.readouterr().out
+
+
+def test_parquet_is_the_same_table(folder, in_process):
+    polars = pytest.importorskip("polars")
+    assert run("--controllers", "idle", "random") == 0
+    frame = polars.read_parquet("results/episodes.parquet")
+    rows = read("results/episodes.csv")
+    assert tuple(frame.columns) == COLUMNS
+    assert [tuple(campaign._cell(cell) for cell in row) for row in frame.rows()] == [tuple(r.values()) for r in rows]
+    assert frame.schema["seed"] == polars.Int64 and frame.schema["success"] == polars.Boolean
+    first = Path("results/episodes.parquet").read_bytes()
+    assert run("--controllers", "idle", "random", "--out", "again") == 0
+    assert Path("again/episodes.parquet").read_bytes() == first
+
+
 def test_a_shard_may_be_empty(folder, in_process, capsys):
     assert run("--controllers", "idle", "--shard", "3/3", "--json") == 0
     assert json.loads(capsys.readouterr().out) == []
@@ -315,7 +398,7 @@ def test_failed_episodes_are_named_and_the_others_complete(folder, in_process, c
 
 
 def test_without_pygame_there_is_no_picture(folder, in_process, monkeypatch, capsys):
-    monkeypatch.setattr(evaluate.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(pictures.importlib.util, "find_spec", lambda name: None)
     assert run("--controllers", "idle") == 0
     said = capsys.readouterr()
     assert "pygame-ce is missing" in said.err
@@ -399,6 +482,18 @@ MISTAKES = [
     ("--controllers mine:Nobody", "controllers: mine:Nobody: module 'mine' has no 'Nobody'"),
     ("--controllers nowhere:X", "module 'nowhere' cannot be imported: ModuleNotFoundError"),
     ("--controllers mine:number", "controller int: lacks lidar and reset and act"),
+    ("--controllers mine:Late", "controller Late: cannot be made: ZeroDivisionError: division by zero (mine.py:"),
+    ("--controllers mine:maker", "controllers: mine:maker: cannot be made: KeyError: 'no' (mine.py:"),
+    ("--body mine:Heavy", "body: mine:Heavy: cannot be made: RuntimeError: too heavy (mine.py:"),
+    ("--flock mine:Wild", "flock: mine:Wild: cannot be made: RuntimeError: too wild (mine.py:"),
+    ("--scenario heavy.toml --body mine:Heavy", "Scenario.shepherds[0]: mine:Heavy: RuntimeError: too heavy"),
+    ("--controllers leaves:X", "controllers: leaves:X: module 'leaves' cannot be imported: SystemExit: 3"),
+    ("--baseline random", "baseline: 'random' is not among the controllers (strombom)"),
+    ("--grid base.toml", "baseline: 'nobody' is not among the controllers (strombom)"),
+    ("--workers 1 --scheduler tcp://127.0.0.1:1", "--workers and --scheduler: the workers are the cluster's then"),
+    ("--gather", "--gather: needs at least one value"),
+    ("--gather nowhere", "nowhere: has no ledger to gather from"),
+    ("--gather other", "other/ledger.sqlite: holds rows of shepherd_phys 0.0.0, this is"),
     ("--flocks 0", "flocks: 0 is impossible; it must be at least 1"),
     ("--flocks abc", "['abc']; --flocks takes whole numbers"),
     ("--flocks", "--flocks: needs at least one value"),
@@ -459,6 +554,9 @@ def test_mistakes_are_one_clear_line(folder, capsys, words, message):
     Path("post.toml").write_text(tomli_w.dumps({**TINY, "obstacles": [{"kind": "mine:Post"}]}))
     Path("broken.toml").write_text(tomli_w.dumps({**TINY, "shepherds": [{"kind": "mine:Cart", "size": -1.0}]}))
     Path("full.toml").write_text(tomli_w.dumps({**TINY, "obstacles": [BOULDER]}))
+    Path("heavy.toml").write_text(tomli_w.dumps({**TINY, "shepherds": [{"kind": "mine:Heavy", "mass": 3.0}]}))
+    Path("leaves.py").write_text("raise SystemExit(3)")
+    Path("base.toml").write_text('baseline = "nobody"')
     Path("words.toml").write_text('flocks = ["two"]')
     Path("true.toml").write_text("trials = true")
     Path("none.toml").write_text("flocks = []")
@@ -494,7 +592,7 @@ def test_a_full_disk(folder, in_process, capsys, monkeypatch):
 
     assert run("--controllers", "idle") == 0
     capsys.readouterr()
-    monkeypatch.setattr("shepherd_phys.campaign.os.fsync", full)
+    monkeypatch.setattr("os.fsync", full)
     assert run("--controllers", "idle") == 1
     said = capsys.readouterr()
     assert said.out == ""
@@ -530,7 +628,7 @@ def test_help_lists_every_flag(capsys):
         main.main(["evaluate", "--help"])
     assert end.value.code == 0
     said = capsys.readouterr().out
-    for flag in (*GRID_KEYS, "grid", "shard", "workers", "timeout", "out", "json"):
+    for flag in (*GRID_KEYS, "grid", "shard", "workers", "scheduler", "timeout", "out", "gather", "json"):
         assert f"--{flag}" in said
 
 
