@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-import io
 import json
 import os
 import sys
@@ -26,7 +25,8 @@ from shepherd_phys.controllers.evaluation import COLUMNS, ControllerError, trial
 from shepherd_phys.controllers.summary import summarise, summary_columns
 from shepherd_phys.settings import SettingsError
 
-from .evaluate import WANTED, _flag, _one_line, cpu_count, print_table, progress_bar, ready
+from .command import at_least, cpu_count, fail, flag, parsed, progress_bar, workforce
+from .evaluate import print_table, ready
 from .pages import PART_HEAD, claims_page, few_trials, figure_page, part_cells
 from .points import episode, points, table, tasks
 
@@ -47,18 +47,22 @@ class Reproduce:
     """Which of the paper's figures; a point that two of them share is run once."""
     literal: tyro.conf.FlagCreatePairsOff[bool] = False
     """Add the heuristics as published: strombom-literal, pierson-reconstructed, elfiqi-literal."""
-    controllers: Annotated[tuple[str, ...], _flag("NAME ..", "all tuned heuristics and shipped policies")] = ()
+    controllers: Annotated[tuple[str, ...], flag("NAME ..", "all tuned heuristics and shipped policies")] = ()
     """Only these, by name or module:Name of your own; claims on others stay undecided."""
-    trials: Annotated[int, _flag("T")] = 100
+    trials: Annotated[int, flag("T")] = 100
     """Episodes a point."""
-    seed: Annotated[int, _flag("S")] = 20_000
+    seed: Annotated[int, flag("S")] = 20_000
     """Root seed: trial i has a seed derived from S and i alone, the same for every controller and point."""
-    workers: Annotated[int, _flag("W")] = cpu_count()
+    workers: Annotated[int, flag("W")] = cpu_count()
     """Worker processes; the results do not depend on it."""
-    timeout: Annotated[float, _flag("SECONDS")] = 600.0
+    scheduler: Annotated[str | None, flag("ADDRESS", "")] = None
+    """Instead of --workers: the scheduler of a Dask cluster, e.g. tcp://10.0.0.1:8786."""
+    timeout: Annotated[float, flag("SECONDS")] = 600.0
     """An episode that takes longer counts as hung."""
-    out: Annotated[Path, _flag("DIR")] = Path("results/reproduce")
+    out: Annotated[Path, flag("DIR")] = Path("results/reproduce")
     """Folder for tables, figures and ledger; an unfinished run in it is continued."""
+    gather: Annotated[tuple[Path, ...], flag("DIR ..", "")] = ()
+    """Folders of other campaigns: episodes that they have are taken over and not run."""
     json: tyro.conf.FlagCreatePairsOff[bool] = False
     """Print one JSON object, the rows of each figure and the claims, and nothing else, on standard output."""
 
@@ -71,7 +75,7 @@ def main(argv: Sequence[str]) -> int:
     try:
         options = read_options(argv)
     except SettingsError as error:
-        return _fail(error, 2)
+        return fail(PROG, error, 2)
     out = sys.stdout
     with contextlib.redirect_stdout(sys.stderr):  # a user's classes may print wherever they are touched
         return _main(options, out)
@@ -85,16 +89,21 @@ def _main(options: Reproduce, out: TextIO) -> int:
         check_drawing()
         todo, everything = work(asked, methods, seeds), work(list(EXPERIMENTS), methods, seeds)
     except (SettingsError, ControllerError) as error:
-        return _fail(error, 2)
+        return fail(PROG, error, 2)
     with progress_bar() as report:
         try:
-            ledger = ready(options.out, todo)
+            ledger = ready(options.out, todo, options.gather)
         except (SettingsError, CampaignError) as error:
-            return _fail(error, 2)
+            return fail(PROG, error, 2)
         with ledger:
             try:
                 outcome = campaign.run(
-                    todo, episode, workers=options.workers, ledger=ledger, timeout=options.timeout, report=report
+                    todo,
+                    episode,
+                    workers=workforce(PROG, options.workers, options.scheduler),
+                    ledger=ledger,
+                    timeout=options.timeout,
+                    report=report,
                 )
                 rows = table(everything, kept(ledger, everything))
                 summaries = {name: summary_of(name, rows, methods) for name in asked}
@@ -106,9 +115,11 @@ def _main(options: Reproduce, out: TextIO) -> int:
                 }
                 paths = write_files(options.out, rows, summaries, claims)
             except CampaignError as error:
-                return _fail(error, 1)
+                return fail(PROG, error, 1)
             except KeyboardInterrupt:
-                return _fail(f"stopped; what was finished is kept in {ledger.path}: the same command continues", 130)
+                return fail(
+                    PROG, f"stopped; what was finished is kept in {ledger.path}: the same command continues", 130
+                )
     if options.json:
         print(json.dumps({**summaries, "claims": claims}, allow_nan=False, indent=1), file=out)
     else:
@@ -245,28 +256,11 @@ def read_options(argv: Sequence[str]) -> Reproduce:
         SettingsError: something is unknown or impossible.
         SystemExit: after ``--help``.
     """
-    said = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(said):
-            options = tyro.cli(Reproduce, prog=PROG, args=list(argv))
-    except SystemExit as end:
-        if not end.code:
-            raise
-        problem = _one_line(said.getvalue())
-        wanted = [f"; --{name} takes {what}" for name, what in WANTED.items() if f"--{name}" in problem]
-        raise SettingsError(f"{problem}{''.join(wanted[:1])} (see {PROG} --help)") from None
+    options, given = parsed(Reproduce, PROG, argv)
     if options.figure not in CHOICES:
         raise SettingsError(f"figure: {options.figure!r} is unknown; there are {', '.join(CHOICES)}")
-    if not options.controllers and any(word.split("=")[0] == "--controllers" for word in argv):
-        raise SettingsError("--controllers: needs at least one value")
-    for name, least in LEAST.items():
-        if getattr(options, name) < least:
-            raise SettingsError(f"{name}: {getattr(options, name)} is impossible; it must be at least {least}")
-    if not options.timeout > 0:
-        raise SettingsError(f"timeout: {options.timeout} is impossible; it must be above 0 s")
+    for name in ("controllers", "gather"):
+        if name in given and not getattr(options, name):
+            raise SettingsError(f"--{name}: needs at least one value")
+    at_least(vars(options), LEAST)
     return options
-
-
-def _fail(error: object, status: int) -> int:
-    print(f"{PROG}: {' '.join(str(error).split())}", file=sys.stderr)
-    return status

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import tyro
 
 from shepherd_phys import __version__, campaign
 from shepherd_phys.campaign import CampaignError, Ledger, settings_hash
@@ -29,7 +28,7 @@ from shepherd_phys.envs.shepherding import ShepherdingEnv
 from shepherd_phys.scenario import SCENARIOS, Scenario
 from shepherd_phys.settings import SettingsError, write_toml
 
-from .evaluate import cpu_count, progress_bar
+from .command import at_least, cpu_count, fail, flag, parsed, progress_bar
 
 PROG = "shepherd-phys tune"
 
@@ -117,33 +116,33 @@ class Tune:
     that the search has not seen, the command and the version.
     """
 
-    controller: Annotated[str, tyro.conf.arg(metavar="|".join(TEAMS))] = "strombom"
+    controller: Annotated[str, flag("|".join(TEAMS))] = "strombom"
     """The team."""
-    rounds: Annotated[int, tyro.conf.arg(metavar="R")] = 5
+    rounds: Annotated[int, flag("R")] = 5
     """Rounds of the search."""
-    candidates: Annotated[int, tyro.conf.arg(metavar="C")] = 8
+    candidates: Annotated[int, flag("C")] = 8
     """Candidates a round."""
-    seed: Annotated[int, tyro.conf.arg(metavar="S")] = 0
+    seed: Annotated[int, flag("S")] = 0
     """Root seed, below 10,000: trial i has a seed derived from S and i alone."""
-    workers: Annotated[int, tyro.conf.arg(metavar="W")] = cpu_count()
+    workers: Annotated[int, flag("W")] = cpu_count()
     """Worker processes; the result does not depend on it."""
-    out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("runs/tuning")
+    out: Annotated[Path, flag("DIR")] = Path("runs/tuning")
     """Folder for the results and the ledger; an unfinished search in it is continued."""
 
 
 def main(argv: Sequence[str]) -> int:
     """Run the command; the exit status: 0, 1 if it could not be done, 2 for a mistake of the user, 130 for Ctrl-C."""
-    options = tyro.cli(Tune, prog=PROG, args=list(argv))
     try:
+        options, _ = parsed(Tune, PROG, argv)
         checked(options)
         with contextlib.redirect_stdout(sys.stderr), Ledger(options.out, __version__) as ledger:
             path = search(options, ledger)
-    except (SettingsError, CampaignError) as error:
-        print(f"{PROG}: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2 if isinstance(error, SettingsError) else 1
+    except SettingsError as error:
+        return fail(PROG, error, 2)
+    except CampaignError as error:
+        return fail(PROG, error, 1)
     except KeyboardInterrupt:
-        print(f"{PROG}: stopped; the same command continues", file=sys.stderr)
-        return 130
+        return fail(PROG, "stopped; the same command continues", 130)
     print(path)
     return 0
 
@@ -158,9 +157,7 @@ def checked(options: Tune) -> None:
         raise SettingsError(f"controller: {options.controller!r} cannot be tuned; there are {', '.join(TEAMS)}")
     if not 0 <= options.seed < TUNING_SEEDS:
         raise SettingsError(f"seed: {options.seed} is no tuning seed; those are 0 to {TUNING_SEEDS - 1}")
-    for name in ("rounds", "candidates", "workers"):
-        if getattr(options, name) < 1:
-            raise SettingsError(f"{name}: {getattr(options, name)} is impossible; it must be at least 1")
+    at_least(vars(options), {"rounds": 1, "candidates": 1, "workers": 1})
     if importlib.util.find_spec("optuna") is None:
         raise SettingsError("optuna is missing: pip install 'shepherd-phys[tune]'")
 
