@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 import tomli_w
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shepherd_phys import __version__, campaign
@@ -57,6 +57,10 @@ class Chase:
 
 class Bad(Chase):
     def act(self, observation, state): return np.full((state.n_shepherds, 2), np.nan)
+
+class Faint(Chase):
+    def reset(self, rng):
+        if rng.random() < 0.5: raise RuntimeError("not today")
 
 class Half:
     lidar = None
@@ -348,12 +352,20 @@ def test_differences_are_paired_with_the_baseline(folder, in_process, capsys):
     ]
 
 
-def test_the_baseline_is_the_first_controller_and_pairs_share_seeds(folder, in_process, capsys):
-    assert run("--controllers", "random", "idle", "mine:Bad", "--shard", "1/2", "--trials", "3", "--json") == 1
+def test_the_baseline_is_the_first_controller_and_pairs_are_of_seeds_that_both_have(folder, in_process, capsys):
+    assert run("--controllers", "random", "mine:Faint", "--trials", "8", "--json") == 1
     rows = {row["controller"]: row for row in json.loads(capsys.readouterr().out)}
-    assert rows["idle"]["differences"]["baseline"] == "random"
-    seeds = {name: {row["seed"] for row in read("results/episodes.csv") if row["controller"] == name} for name in rows}
-    assert rows["idle"]["differences"]["trials"] == len(seeds["idle"] & seeds["random"])
+    assert 0 < rows["mine:Faint"]["trials"] < 8 == rows["random"]["trials"]
+    assert rows["random"]["differences"] is None
+    assert rows["mine:Faint"]["differences"]["baseline"] == "random"
+    assert rows["mine:Faint"]["differences"]["trials"] == rows["mine:Faint"]["trials"]
+
+
+def test_without_a_row_of_the_baseline_there_are_no_differences(folder, in_process, capsys):
+    assert run("--controllers", "mine:Bad", "idle", "--json") == 1
+    (row,) = json.loads(capsys.readouterr().out)
+    assert (row["controller"], row["differences"]) == ("idle", None)
+    assert Path("results/differences.csv").read_text() == ",".join(difference_columns()) + "\n"
 
 
 def test_tables_of_an_earlier_command_do_not_stay(folder, in_process, monkeypatch, capsys):
@@ -444,6 +456,7 @@ VALUES = {
 }
 
 
+@settings(deadline=None)
 @given(st.fixed_dictionaries({}, optional=VALUES))
 def test_points_are_the_full_cross_product_without_repeats(lists):
     found = points(**{"controllers": ["idle"], **lists})
