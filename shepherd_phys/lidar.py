@@ -344,7 +344,9 @@ def observe(stack: Proximities, offset: NDArray[np.int64], lidar: Lidar) -> tupl
         lit, or more than half of them (then the shepherd stands inside; obstacles so near to the goal that they cut
         half of the way out hide that from it).
     """
-    return _observe(np.array(stack, np.float32), np.asarray(offset, np.int64), lidar)
+    rolled = lidar.frame == "goal" or (lidar.sectors or lidar.beams) != lidar.beams  # then it is fresh anyway
+    frames = np.ascontiguousarray(stack, np.float32) if rolled else np.array(stack, np.float32)
+    return _observe(frames, np.asarray(offset, np.int64), lidar)
 
 
 def _observe(stack: Proximities, offset: NDArray[np.int64], lidar: Lidar) -> tuple[Proximities, NDArray[np.int64]]:
