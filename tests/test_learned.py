@@ -40,6 +40,7 @@ from shepherd_phys.settings import Foreign, SettingsError
 from shepherd_phys.world import World
 
 LIDAR = Lidar(beams=64, sectors=16, stack=2, frame="goal")
+STATE = World(SCENARIOS["small"]).reset(0)
 SMALL = SectorNetwork(features=5, hidden=7, latent=6)
 
 
@@ -127,7 +128,7 @@ def test_it_acts_by_its_network_in_the_frame_of_the_goal(policy_path):
         seen, *_ = reference.step(action)
 
 
-@hypothesis_settings(deadline=None)
+@hypothesis_settings(deadline=None, max_examples=30)
 @given(st.integers(0, 2**32 - 1))
 def test_actions_lie_in_the_unit_disc(seed):
     lidar = Lidar(beams=16, stack=1)
@@ -135,7 +136,7 @@ def test_actions_lie_in_the_unit_disc(seed):
     weights["action.weight"] *= 10
     policy = Policy(spec_of(lidar), weights)
     observation = np.random.default_rng(seed).random((5, 3, 16), dtype=np.float32)
-    action = policy.act(observation, World(SCENARIOS["small"]).reset(0))
+    action = policy.act(observation, STATE)
     assert (np.hypot(*action.T) <= 1 + 1e-12).all()
     raw = np.clip(Actor(SMALL, lidar, weights)(observation), -1, 1)
     for a, b in zip(action, raw, strict=True):
@@ -159,12 +160,11 @@ def test_a_decision_is_held_for_its_interval():
 def test_each_shepherd_acts_alone():
     """Whoever else is in the team: the same observation, the same action."""
     policy = Policy(spec_of(), random_weights(SMALL, LIDAR))
-    state = World(SCENARIOS["small"]).reset(0)
     observation = np.random.default_rng(0).random((3, 6, 64), dtype=np.float32)
-    together = policy.act(observation, state)
+    together = policy.act(observation, STATE)
     for k in range(3):
         policy.reset(np.random.default_rng(0))
-        assert policy.act(observation[k : k + 1], state) == pytest.approx(together[k : k + 1], abs=1e-6)
+        assert policy.act(observation[k : k + 1], STATE) == pytest.approx(together[k : k + 1], abs=1e-6)
 
 
 def test_evaluation_names_it_and_identifies_it_by_its_checksum(policy_path):
