@@ -432,7 +432,7 @@ def test_files_that_are_none(policy_path, tmp_path):
     weights.symlink_to(tmp_path / "elsewhere")  # a link to data is as good as data
     assert load_policy(policy_path).checksum
     assert (tmp_path / "elsewhere").read_bytes() == kept
-    for name in ("p", "p.safetensors", "p.zip", "", ".", "..", "/", "p.json/", "\0.json", "x" * 5000 + ".json"):
+    for name in ("p", "p.safetensors", "p.zip", "", ".", "..", "/", "\0.json", "x" * 5000 + ".json"):
         with pytest.raises(PolicyError):
             load_policy(tmp_path / name)
 

@@ -6,25 +6,12 @@ from typing import Any
 
 import torch
 from gymnasium import spaces
-from pydantic import Field
 from stable_baselines3.common.policies import MultiInputActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, MlpExtractor
 from torch import nn
 
 from shepherd_phys.controllers.network import SectorNetwork
-from shepherd_phys.settings import Settings, settings
-
-
-@settings
-class CriticNetwork(Settings):
-    """The critic: groups of its own as the actor's, joined with what it may see of the world, and two layers."""
-
-    world: int = Field(default=128, ge=1, le=4096)
-    """Width of the layer over the numbers of the world, where the critic is given them."""
-    hidden: int = Field(default=192, ge=1, le=4096)
-    """Width of the layer that joins both."""
-    latent: int = Field(default=64, ge=1, le=4096)
-    """Width of the last layer before the value."""
+from shepherd_phys.learning.preset import CriticNetwork
 
 
 class SectorFeatures(BaseFeaturesExtractor):

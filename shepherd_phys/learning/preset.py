@@ -11,7 +11,6 @@ from pydantic import BeforeValidator, Field
 from shepherd_phys.controllers.network import SectorNetwork
 from shepherd_phys.envs.mixture import Mixture
 from shepherd_phys.envs.rewards import SCHEMES, Effort, Term
-from shepherd_phys.learning.network import CriticNetwork
 from shepherd_phys.lidar import Lidar
 from shepherd_phys.scenario import SCENARIOS, Scenario
 from shepherd_phys.settings import Settings, SettingsError, read_toml, settings, write_toml
@@ -26,6 +25,18 @@ def _listed(value: Any) -> Any:
 Count = Annotated[int, Field(ge=1)]
 Counts = Annotated[tuple[Count, ...], Field(min_length=1), BeforeValidator(_listed)]
 Range = Annotated[tuple[Count, Count], BeforeValidator(_listed)]
+
+
+@settings
+class CriticNetwork(Settings):
+    """The critic: groups of its own as the actor's, joined with what it may see of the world, and two layers."""
+
+    world: int = Field(default=128, ge=1, le=4096)
+    """Width of the layer over the numbers of the world, where the critic is given them."""
+    hidden: int = Field(default=192, ge=1, le=4096)
+    """Width of the layer that joins both."""
+    latent: int = Field(default=64, ge=1, le=4096)
+    """Width of the last layer before the value."""
 
 
 @settings
