@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import BeforeValidator, Field
 
 from shepherd_phys.canvas import Canvas, Floats, Picture, Size, lettering, mixed, png
+from shepherd_phys.files import whole_file
 from shepherd_phys.obstacles import Obstacle, Point, solid
 from shepherd_phys.settings import Settings, settings
 from shepherd_phys.state import WorldState, unit
@@ -378,12 +379,8 @@ def save_png(picture: Picture, path: str | Path) -> None:
     if not fits or not picture.size:
         raise ValueError("picture: must be uint8 (h, w, 3), as draw gives it")
     written, path = png(picture), Path(path)
-    temporary = path.with_name(path.name + ".part")
     try:
-        try:
-            temporary.write_bytes(written)
-            temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        with whole_file(path) as part:
+            part.write_bytes(written)
     except OSError as error:
         raise OSError(error.errno, f"picture cannot be written ({error.strerror})", str(path)) from None

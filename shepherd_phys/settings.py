@@ -10,13 +10,14 @@ import dataclasses
 import inspect
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self, TypeVar, cast, dataclass_transform
 
 import pydantic
 import tomli_w
 from pydantic import ConfigDict
+
+from shepherd_phys.files import whole_file
 
 T = TypeVar("T")
 
@@ -232,13 +233,8 @@ def write_toml(table: Mapping[str, Any], path: str | Path) -> None:
     path = Path(path)
     try:
         text = tomli_w.dumps(table)
-        temporary = path.with_name(path.name + ".part")
-        try:
-            temporary.write_bytes(text.encode())
-            temporary.replace(path)
-        finally:
-            with suppress(OSError):
-                temporary.unlink()
+        with whole_file(path) as part:
+            part.write_bytes(text.encode())
     except OSError as error:
         raise SettingsError(f"{path}: cannot be written ({error.strerror})") from None
     except (TypeError, ValueError) as error:

@@ -15,10 +15,11 @@ import signal
 import threading
 import time
 import traceback
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from multiprocessing import connection
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, Protocol, Self
 
 Work = Callable[[Any, int], Mapping[str, Any]]
 """What a worker does: (spec, seed) -> a row of plain data. A function of a module, so that it can be sent."""
@@ -34,18 +35,63 @@ START_FAILURES = 3
 
 
 class WorkersError(RuntimeError):
-    """No worker can be started; the message says why."""
+    """No worker can be started or reached; the message says why."""
+
+
+class Job(NamedTuple):
+    """``work(spec, seed)``, to be done."""
+
+    key: Any
+    """Comes back with the job's end; not None."""
+    spec: Any
+    seed: int
 
 
 class Ended(NamedTuple):
     """How a job ended: with a result, or with the cause of its failure."""
 
     key: Any
-    """What `Workers.give` was given with the job."""
+    """The job's."""
     result: str | None
     """The row as JSON text; None if there is none."""
     cause: str
     """Why there is none, one line."""
+
+
+class Pool(Protocol):
+    """Workers to whom jobs are given one by one."""
+
+    def idle(self) -> bool:
+        """Whether there is room for a job."""
+        ...
+
+    def give(self, job: Job) -> None:
+        """Hand over a job; only while there is room."""
+        ...
+
+    def wait(self) -> list[Ended]:
+        """Sleep until something happens: jobs end (they are returned), or there may be room again.
+
+        Raises:
+            WorkersError: there is no hope of more.
+        """
+        ...
+
+
+def finished(pool: Pool, waiting: deque[Job]) -> Iterator[Ended]:
+    """Have a pool do the jobs that wait, and those that are appended meanwhile; how they end, as they end.
+
+    Raises:
+        WorkersError: of the pool.
+    """
+    busy = 0
+    while waiting or busy:
+        while waiting and pool.idle():
+            pool.give(waiting.popleft())
+            busy += 1
+        for ended in pool.wait():
+            busy -= 1
+            yield ended
 
 
 class Workers:
@@ -82,9 +128,10 @@ class Workers:
         """Whether a worker is free for a job."""
         return any(worker.ready and worker.key is None for worker in self._crew)
 
-    def give(self, key: Any, spec: Any, seed: int) -> None:
-        """Hand ``work(spec, seed)`` to a free worker; ``key`` (not None) comes back with its end."""
-        next(w for w in self._crew if w.ready and w.key is None).give(key, pickle.dumps((spec, seed)), self._timeout)
+    def give(self, job: Job) -> None:
+        """Hand a job to a free worker."""
+        free = next(worker for worker in self._crew if worker.ready and worker.key is None)
+        free.give(job.key, pickle.dumps((job.spec, job.seed)), self._timeout)
 
     def wait(self) -> list[Ended]:
         """Sleep until something happens: jobs end (they are returned), or a worker becomes free.

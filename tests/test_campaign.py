@@ -347,7 +347,7 @@ def test_a_table_that_cannot_be_written_leaves_the_old_one(tmp_path, monkeypatch
     def full(fd):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(campaign.os, "fsync", full)
+    monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(CampaignError, match=r"t\.csv: cannot be written \(No space left on device\)"):
         write_csv(path, ["a"], [{"a": 2}])
     assert contents(tmp_path) == {"t.csv": b"a\n1\n"}

@@ -14,6 +14,7 @@ FOLDERS = ("shepherd_phys", "envs", "controllers", "scripts")
 # A module imports from the lines above its own and from its own. Obstacles stand above the state because
 # a state carries those of its world.
 ORDER = (
+    ("files",),
     ("settings", "cells", "neighbours", "workers", "_frames", "_motion", "_shapes", "_raycast"),
     ("bodies", "obstacles"),
     ("state",),
@@ -21,15 +22,18 @@ ORDER = (
     ("flock", "lidar"),
     ("scenario",),
     ("world",),
-    ("canvas", "campaign"),
+    ("canvas", "cluster", "ledger"),
+    ("campaign",),
     ("render",),
 )
 RANK = {name: rank for rank, names in enumerate(ORDER) for name in names}
 TRAINING = {"torch", "stable_baselines3"}
 DRAWING = {"canvas", "render"}
 ANALYSIS = {"matplotlib", "scipy", "polars"}
-# what the simulator does not import; only what analyses may wait inside a function, and pygame inside one that draws
-FOREIGN = {"gymnasium", "pettingzoo", "pygame"} | TRAINING | ANALYSIS
+CLUSTER = {"distributed", "dask"}
+# what the simulator does not import; only what analyses may wait inside a function, pygame inside one that draws, and
+# distributed inside one of the cluster's
+FOREIGN = {"gymnasium", "pettingzoo", "pygame"} | TRAINING | ANALYSIS | CLUSTER
 MAY_TRAIN = ("envs/team.py", "shepherd_phys/learning/", "scripts/train.py")
 
 
@@ -75,6 +79,7 @@ def violations(path: str, source: str) -> list[str]:
         if room != "shepherd_phys":
             continue
         waits = not at_import and (top in ANALYSIS or (top == "pygame" and stem in DRAWING))
+        waits |= not at_import and top in CLUSTER and stem == "cluster"
         if top in FOREIGN and not inner and not waits:
             wrong.append(f"{name}: not in the simulator")
         # learning alone stands on envs and controllers too
@@ -118,6 +123,8 @@ def test_modules_of_the_simulator_have_a_place_in_the_order() -> None:
         ("shepherd_phys/world.py", "import gymnasium as gym"),
         ("shepherd_phys/world.py", "def f():\n    import pygame"),
         ("shepherd_phys/campaign.py", "import polars"),
+        ("shepherd_phys/cluster.py", "import distributed"),
+        ("shepherd_phys/campaign.py", "def f():\n    import distributed"),
         ("shepherd_phys/render.py", "import pygame"),
         ("shepherd_phys/render.py", "class Window:\n    import pygame"),
         ("shepherd_phys/state.py", "if typing.TYPE_CHECKING:\n    import numpy"),
@@ -143,6 +150,7 @@ def test_a_forbidden_import_is_seen(path: str, source: str) -> None:
     [
         ("shepherd_phys/render.py", "def f():\n    import pygame"),
         ("shepherd_phys/campaign.py", "def f():\n    import polars"),
+        ("shepherd_phys/cluster.py", "def f():\n    import distributed"),
         ("shepherd_phys/world.py", "from shepherd_phys.scenario import Scenario"),
         ("shepherd_phys/learning/ppo.py", "import torch\nfrom shepherd_phys.learning.network import Network"),
         ("shepherd_phys/learning/ppo.py", "from shepherd_phys.envs.team import TeamVecEnv"),
@@ -168,7 +176,9 @@ def test_no_file_names_a_place_on_one_machine() -> None:
 
 def test_importing_the_package_is_light() -> None:
     """Numbers only: nothing that trains, draws or analyses is loaded."""
-    heavy = (TRAINING | ANALYSIS | {"pygame"}) - {"scipy"}  # numba loads scipy by itself where it is installed
+    heavy = (TRAINING | ANALYSIS | CLUSTER | {"pygame"}) - {
+        "scipy"
+    }  # numba loads scipy by itself where it is installed
     code = f"""
 import sys
 import shepherd_phys, shepherd_phys.envs, shepherd_phys.controllers

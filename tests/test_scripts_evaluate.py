@@ -494,7 +494,7 @@ def test_a_full_disk(folder, in_process, capsys, monkeypatch):
 
     assert run("--controllers", "idle") == 0
     capsys.readouterr()
-    monkeypatch.setattr("shepherd_phys.campaign.os.fsync", full)
+    monkeypatch.setattr("os.fsync", full)
     assert run("--controllers", "idle") == 1
     said = capsys.readouterr()
     assert said.out == ""
