@@ -9,10 +9,8 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
 import stat
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -24,6 +22,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from shepherd_phys import __version__
+from shepherd_phys.files import whole_file
 from shepherd_phys.lidar import Lidar
 from shepherd_phys.scenario import Scenario
 from shepherd_phys.settings import Settings, SettingsError, settings, tagged, untagged
@@ -114,8 +113,9 @@ def write_policy(path: str | Path, spec: PolicySpec, weights: Mapping[str, NDArr
         raise PolicyError(f"{path}: what describes the policy must be plain, finite data ({error})") from None
     try:
         # the weights first: a JSON file that is there finds its weights, unless it is replacing an older pair
-        _write(path.with_suffix(".safetensors"), blob)
-        _write(path, text.encode())
+        for file, content in ((path.with_suffix(".safetensors"), blob), (path, text.encode())):
+            with whole_file(file) as part:
+                part.write_bytes(content)
     except OSError as error:
         raise PolicyError(f"{path}: cannot be written ({error.strerror})") from None
     return str(table["checksum"])
@@ -271,20 +271,6 @@ def _read(path: Path, most: int) -> bytes:
     if len(blob) > most:
         raise PolicyError(f"{path}: is larger than the {most} bytes that a policy may have here")
     return blob
-
-
-def _write(path: Path, blob: bytes) -> None:
-    """Write a file so that it is there whole or not at all, after a power cut too."""
-    temporary = path.with_name(path.name + ".part")
-    try:
-        with open(temporary, "wb") as file:
-            file.write(blob)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
-        with suppress(OSError):
-            temporary.unlink()
 
 
 def _brief(text: str) -> str:

@@ -11,6 +11,7 @@ from shepherd_phys import __version__
 
 COMMANDS = {
     "evaluate": "run controllers over a grid of experiments and write the tables",
+    "train": "learn a policy, with checkpoints from which a stopped run goes on",
     "benchmark": "measure how fast the simulator is on this machine",
 }
 """A command is the file of its name in this folder, with ``main(argv) -> exit status``."""

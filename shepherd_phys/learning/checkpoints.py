@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import re
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +14,8 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 from numpy.typing import NDArray
+
+from shepherd_phys.files import whole_file
 
 Array = NDArray[Any]
 
@@ -50,17 +50,8 @@ def save(folder: Path, checkpoint: Checkpoint) -> Path:
     try:
         blob = safetensors.numpy.save(arrays, metadata={"checkpoint": json.dumps(facts, allow_nan=False)})
         folder.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(path.name + ".part")
-        try:
-            with open(temporary, "wb") as file:
-                file.write(blob)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(temporary, path)
-        finally:
-            with suppress(OSError):
-                temporary.unlink()
-        _sync(folder)
+        with whole_file(path) as part:
+            part.write_bytes(blob)
         for old in _paths(folder)[:-KEPT]:
             old.unlink()
     except OSError as error:
@@ -119,13 +110,3 @@ def _digest(arrays: Mapping[str, Array]) -> str:
         total.update(f"{name} {arrays[name].dtype} {arrays[name].shape}\n".encode())
         total.update(np.ascontiguousarray(arrays[name]).tobytes())
     return total.hexdigest()
-
-
-def _sync(folder: Path) -> None:
-    """Bring the folder's entries to the disk, where folders can be opened."""
-    with suppress(OSError):
-        handle = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)

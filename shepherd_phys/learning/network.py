@@ -59,7 +59,7 @@ class TeamPolicy(MultiInputActorCriticPolicy):
         action_space: of one shepherd.
         lr_schedule: learning rate.
         network: sizes of the actor.
-        critic: sizes of the critic.
+        critic: sizes of the critic; of both, none given: the default ones.
         options: further ones of stable-baselines3's policies, such as ``log_std_init``.
     """
 
@@ -68,17 +68,15 @@ class TeamPolicy(MultiInputActorCriticPolicy):
         observation_space: spaces.Dict,
         action_space: spaces.Box,
         lr_schedule: Any,
-        network: SectorNetwork = SectorNetwork(),
-        critic: CriticNetwork = CriticNetwork(),
+        network: SectorNetwork | None = None,
+        critic: CriticNetwork | None = None,
         **options: Any,
     ) -> None:
-        self.network, self.critic = network, critic
+        self.network, self.critic = network or SectorNetwork(), critic or CriticNetwork()
         super().__init__(
             observation_space,
             action_space,
             lr_schedule,
-            net_arch={"pi": [network.latent], "vf": [critic.latent]},
-            activation_fn=nn.Tanh,
             features_extractor_class=SectorFeatures,
             share_features_extractor=False,
             **options,
@@ -86,10 +84,11 @@ class TeamPolicy(MultiInputActorCriticPolicy):
 
     def make_features_extractor(self) -> BaseFeaturesExtractor:
         """The actor's at the first call, the critic's at the second, as stable-baselines3 makes them."""
+        space = self.observation_space
+        assert isinstance(space, spaces.Dict)
         if "pi_features_extractor" not in self._modules:
-            return SectorFeatures(self.observation_space, self.network, self.network.hidden)
-        world = self.critic.world if "critic" in self.observation_space.spaces else 0
-        return SectorFeatures(self.observation_space, self.network, self.critic.hidden, world)
+            return SectorFeatures(space, self.network, self.network.hidden)
+        return SectorFeatures(space, self.network, self.critic.hidden, self.critic.world if "critic" in space else 0)
 
     def _build_mlp_extractor(self) -> None:
         heads = MlpExtractor(self.network.hidden, {"pi": [self.network.latent], "vf": []}, nn.Tanh, self.device)

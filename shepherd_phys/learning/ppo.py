@@ -81,7 +81,8 @@ class Learner:
                 device="cpu",
             )
         self.model.set_logger(logger or Logger(folder=None, output_formats=[]))
-        self.policy: TeamPolicy = self.model.policy
+        assert isinstance(self.model.policy, TeamPolicy)
+        self.policy = self.model.policy
         self.rollouts = 0
         """Rollouts learned from since the run began."""
         self._steps_before = 0

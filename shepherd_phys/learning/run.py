@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -18,26 +17,21 @@ from shepherd_phys.controllers.policy_files import write_policy
 from shepherd_phys.learning import checkpoints
 from shepherd_phys.learning.checkpoints import Checkpoint
 from shepherd_phys.learning.export import spec_of, to_policy
-from shepherd_phys.learning.ppo import Learner, TrainingError
+from shepherd_phys.learning.folder import (
+    BEST,
+    CHECKPOINTS,
+    CURVE,
+    CURVE_COLUMNS,
+    POLICY,
+    PRESET,
+    TENSORBOARD,
+    VALIDATION,
+    VALIDATION_COLUMNS,
+    Table,
+)
+from shepherd_phys.learning.ppo import Learner
 from shepherd_phys.learning.preset import Preset
-from shepherd_phys.learning.validation import MEASURES, validator
-
-PRESET = "preset.toml"
-CURVE = "curve.csv"
-VALIDATION = "validation.csv"
-POLICY = "policy.json"
-BEST = "best.json"
-CHECKPOINTS = "checkpoints"
-TENSORBOARD = "tensorboard"
-
-CURVE_COLUMNS = (
-    "rollout", "shepherd_steps", "decisions", "seconds", "episodes", "episode_reward", "in_goal_end", "path_length",
-    "value_loss", "policy_gradient_loss", "approx_kl", "clip_fraction", "explained_variance", "std",
-)  # fmt: skip
-"""Of ``curve.csv``, one row a rollout: counts and wall-clock seconds since the run began; means over the whole
-episodes that ended in the rollout, empty where none did; PPO's measures."""
-VALIDATION_COLUMNS = ("checkpoint", "shepherd_steps", "n_flocks", "cohesion", "n_shepherds", "trials", *MEASURES)
-"""Of ``validation.csv``, one row a validation and point."""
+from shepherd_phys.learning.validation import validator
 
 
 class Progress(NamedTuple):
@@ -61,30 +55,15 @@ class Best(NamedTuple):
     weights: dict[str, NDArray[np.float32]]
 
 
-def begin(folder: Path, preset: Preset) -> None:
-    """Make the folder of a new run, with its preset.
-
-    Raises:
-        TrainingError: it holds a run already, or cannot be made.
-    """
-    if (folder / PRESET).exists():
-        raise TrainingError(f"{folder} holds a run: --resume continues it; another run needs another folder")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise TrainingError(f"{folder}: cannot be made ({error.strerror})") from None
-    preset.to_toml(folder / PRESET)
-
-
 def train(folder: Path, n_workers: int = 1, report: Callable[[Progress], None] = lambda _: None) -> Best | None:
-    """Train in a folder that `begin` made, from its last checkpoint if it has one, until the budget is spent.
+    """Train in a folder, from its last checkpoint if it has one, until the budget is spent.
 
     Writes `CURVE`, `VALIDATION`, checkpoints and what TensorBoard reads; `POLICY`, the latest policy, and `BEST`, the
     best by validation. Killed at any moment it loses at most what came after the last checkpoint, and goes on from
     there exactly as if it had not been killed.
 
     Args:
-        folder: of the run.
+        folder: of the run, made by `shepherd_phys.learning.folder.begin`.
         n_workers: processes for the worlds, and as many for validations; 1: none but this one. Results do not depend
             on it.
         report: called after each rollout and each validation.
@@ -190,32 +169,3 @@ class _Clock:
     def rate(self, shepherd_steps: int) -> float:
         """Shepherd-steps a second."""
         return (shepherd_steps - self._steps) / max(time.monotonic() - self._began, 1e-9)
-
-
-class Table:
-    """A CSV file that grows row by row; what a killed run wrote after its checkpoint is cut off.
-
-    Args:
-        path: of the file.
-        columns: its columns; the first one counts.
-        last: rows that count further are cut off, and a torn one.
-    """
-
-    def __init__(self, path: Path, columns: Sequence[str], last: int) -> None:
-        self._path, self._columns = path, columns
-        rows: list[list[str]] = []
-        if path.exists():
-            with open(path, newline="", encoding="utf-8") as file:
-                rows = list(csv.reader(file))[1:]
-        kept = [row for row in rows if len(row) == len(columns) and row[0].isdecimal() and int(row[0]) <= last]
-        temporary = path.with_name(path.name + ".part")
-        with open(temporary, "w", newline="", encoding="utf-8") as file:
-            csv.writer(file).writerows([list(columns), *kept])
-        temporary.replace(path)
-
-    def add(self, row: Mapping[str, Any]) -> None:
-        """Append a row; what is NaN or missing stays empty."""
-        cells = [row.get(name) for name in self._columns]
-        cells = ["" if cell is None or (isinstance(cell, float) and math.isnan(cell)) else cell for cell in cells]
-        with open(self._path, "a", newline="", encoding="utf-8") as file:
-            csv.writer(file).writerow(cells)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, NamedTuple
@@ -12,30 +13,30 @@ import numpy as np
 from shepherd_phys.controllers.evaluation import run_episode, trial_seed
 from shepherd_phys.controllers.learned import Policy
 from shepherd_phys.envs.shepherding import ShepherdingEnv
+from shepherd_phys.learning.folder import MEASURES
 from shepherd_phys.learning.preset import Preset
 from shepherd_phys.scenario import Scenario
-from shepherd_phys.workers import Workers
+from shepherd_phys.workers import Job, Workers, finished
 
 TIMEOUT = 600.0
 """An episode that takes longer is lost [s]."""
-MEASURES = ("in_goal_end", "ever_in_goal", "mean_occupancy", "path_length", "time_to_95", "success")
 
 
 class ValidationError(RuntimeError):
     """An episode of a validation did not end; the message says why."""
 
 
-class Job(NamedTuple):
+class Play(NamedTuple):
     """A policy in a world: what a worker is sent."""
 
     policy: Policy
     scenario: Scenario
 
 
-def episode(job: Job, seed: int) -> Mapping[str, Any]:
+def episode(play: Play, seed: int) -> Mapping[str, Any]:
     """Run one episode."""
-    env = ShepherdingEnv(job.scenario, rewards={}, lidar=job.policy.lidar)
-    return run_episode(job.policy, env, seed)
+    env = ShepherdingEnv(play.scenario, rewards={}, lidar=play.policy.lidar)
+    return run_episode(play.policy, env, seed)
 
 
 class Validator:
@@ -65,11 +66,19 @@ class Validator:
         Raises:
             ValidationError: an episode did not end.
         """
-        keys = [(i, seed) for i in range(len(self.points)) for seed in self._seeds]
+        jobs = [
+            Job((i, seed), Play(policy, scenario), seed)
+            for i, scenario in enumerate(self._scenarios)
+            for seed in self._seeds
+        ]
+        rows: dict[tuple[int, int], Mapping[str, Any]] = {}
         if self._workers is None:
-            rows = {key: episode(Job(policy, self._scenarios[key[0]]), key[1]) for key in keys}
+            rows = {job.key: episode(job.spec, job.seed) for job in jobs}
         else:
-            rows = self._in_workers(self._workers, policy, keys)
+            for ended in finished(self._workers, deque(jobs)):
+                if ended.result is None:
+                    raise ValidationError(f"validation, seed {ended.key[1]}: {ended.cause}")
+                rows[ended.key] = json.loads(ended.result)
         return [
             {
                 **point,
@@ -78,21 +87,6 @@ class Validator:
             }
             for i, point in enumerate(self.points)
         ]
-
-    def _in_workers(
-        self, workers: Workers, policy: Policy, keys: list[tuple[int, int]]
-    ) -> dict[tuple[int, int], Mapping[str, Any]]:
-        waiting = list(reversed(keys))
-        rows: dict[tuple[int, int], Mapping[str, Any]] = {}
-        while len(rows) < len(keys):
-            while waiting and workers.idle():
-                key = waiting.pop()
-                workers.give(key, Job(policy, self._scenarios[key[0]]), key[1])
-            for ended in workers.wait():
-                if ended.result is None:
-                    raise ValidationError(f"validation, seed {ended.key[1]}: {ended.cause}")
-                rows[ended.key] = json.loads(ended.result)
-        return rows
 
     def score(self, rows: list[dict[str, Any]]) -> float:
         """What the best policy has most of: percent of the sheep in at the end, mean over the points, less walking."""
