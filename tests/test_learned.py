@@ -20,7 +20,7 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from shepherd_phys.bodies import Disc
-from shepherd_phys.controllers import Policy, load_policy
+from shepherd_phys.controllers import CONTROLLERS, POLICIES, Policy, load_policy
 from shepherd_phys.controllers.evaluation import evaluate
 from shepherd_phys.controllers.network import Actor, SectorNetwork
 from shepherd_phys.controllers.policy_files import (
@@ -36,6 +36,7 @@ from shepherd_phys.controllers.policy_files import (
 from shepherd_phys.envs import ShepherdingEnv
 from shepherd_phys.lidar import Lidar, observe, turn
 from shepherd_phys.scenario import SCENARIOS, Scenario
+from shepherd_phys.scripts.points import find_controller, points
 from shepherd_phys.settings import Foreign, SettingsError
 from shepherd_phys.world import World
 
@@ -491,3 +492,23 @@ def test_observe_leaves_the_frames_alone():
         seen, _ = observe(stack, np.zeros(2, np.int64), lidar)
         seen[:] = 7.0
         np.testing.assert_array_equal(stack, kept)
+
+
+def test_the_command_line_takes_a_policy_file_and_knows_it_by_its_checksum(policy_path, tmp_path):
+    assert find_controller(str(policy_path)).checksum == read_policy(policy_path)[2]
+    with pytest.raises(SettingsError, match=r"a policy's \.json file"):
+        find_controller("p")
+    copy = tmp_path / "a:copy.json"
+    write_policy(copy, *read_policy(policy_path)[:2])
+    write_policy(tmp_path / "q.json", spec_of(), random_weights(SMALL, LIDAR, seed=1))
+    hashes = [
+        points(controllers=[str(path)], scenario="small")[0].settings_hash()
+        for path in (policy_path, copy, tmp_path / "q.json")
+    ]
+    assert hashes[0] == hashes[1] != hashes[2]
+
+
+def test_every_shipped_policy_is_a_controller_and_whole():
+    for name in POLICIES:
+        assert CONTROLLERS[name] is POLICIES[name]
+        assert POLICIES[name]().checksum
