@@ -195,7 +195,7 @@ def test_a_nan_of_the_worlds_is_named(where, learner, monkeypatch):
 def test_a_nan_of_the_network_is_named(learner):
     with torch.no_grad():
         learner.policy.pi_features_extractor.hidden.weight[0, 0] = np.inf
-    with pytest.raises(TrainingError, match=r"pi_features_extractor\.hidden\.weight"):
+    with pytest.raises(TrainingError, match=r"features_extractor\.hidden\.weight"):
         learner.learn()
 
 

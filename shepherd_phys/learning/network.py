@@ -88,7 +88,8 @@ class TeamPolicy(MultiInputActorCriticPolicy):
         assert isinstance(space, spaces.Dict)
         if "pi_features_extractor" not in self._modules:
             return SectorFeatures(space, self.network, self.network.hidden)
-        return SectorFeatures(space, self.network, self.critic.hidden, self.critic.world if "critic" in space else 0)
+        world = self.critic.world if "critic" in space.spaces else 0
+        return SectorFeatures(space, self.network, self.critic.hidden, world)
 
     def _build_mlp_extractor(self) -> None:
         heads = MlpExtractor(self.network.hidden, {"pi": [self.network.latent], "vf": []}, nn.Tanh, self.device)
