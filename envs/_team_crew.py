@@ -208,8 +208,11 @@ class _Worker:
         )
         self.busy = True  # starting
         self._ready = self._torn = False
-        with birth():
-            self.process.start()
+        try:
+            with birth():
+                self.process.start()
+        except OSError as error:
+            raise WorkerError(f"{self.name}: cannot start ({error})") from error
         theirs.close()
 
     def send(self, message: bytes) -> None:

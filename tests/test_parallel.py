@@ -71,7 +71,7 @@ def test_it_is_shepherding_env_agent_by_agent(variant):
                 assert rewards[agent] == pytest.approx(expected + own, rel=1e-12)
         done = ended or cut
     assert env.agents == []
-    assert single.state.step == (26 if variant == "may succeed" else 15)
+    assert single.state.step == (25 if variant == "may succeed" else 15)
     assert env.step({}) == ({}, {}, {}, {}, {})
     assert env.reset()[0].keys() == set(env.possible_agents)
 

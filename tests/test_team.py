@@ -479,7 +479,7 @@ def test_attributes_and_methods_of_worlds(n_workers):
         assert len(env.get_images()) == 2
         assert env.render().ndim == 3
         assert env.env_is_wrapped(Monitor) == [False] * 3
-        with pytest.raises(SettingsError, match="render size"):
+        with pytest.raises(ValueError, match="size: must be"):
             env.env_method("render", (-1, 0), indices=0)
         env.step(np.zeros((3, 2)))  # none of that has done any harm
     finally:
