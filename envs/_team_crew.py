@@ -24,7 +24,7 @@ from shepherd_phys.workers import birth, end_with_owner, explain
 
 from ._team_world import Ending, Plan, TeamWorld
 
-WORLD_COST = 4.0
+WORLD_COST = 7.0
 """What a control step of a world costs apart from its shepherds, each of whom costs 1 (measured, roughly)."""
 
 Answer = dict[int, Any]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from shepherd_phys.lidar import Lidar, Scan, Stack, encode, turn
 from shepherd_phys.scenario import Scenario
 from shepherd_phys.settings import SettingsError
-from shepherd_phys.state import Floats, WorldState
+from shepherd_phys.state import WorldState
 from shepherd_phys.world import World
 
 from ._critic import N_NUMBERS, whole_world
@@ -154,13 +154,14 @@ class TeamWorld:
         action = turn(actions, self.beam_offset, plan.lidar.beams) if goal_frame else actions
         first = world.state.step
         last = min(first + plan.decision_interval, scenario.n_steps - self.clock)
-        summed = np.zeros(self.n_shepherds)
+        summed = [0.0] * self.n_shepherds
         terminated = False
         while True:
             before = world.state
             after = world.step(action)
             scan = self._look()
-            summed += self._reward(earned(plan.scheme, before, after, scan, scenario))
+            own = self._own(earned(plan.scheme, before, after, scan, scenario))
+            summed = [total + reward for total, reward in zip(summed, own, strict=True)]
             if scenario.terminate_on_success:
                 terminated = self._held(after, measures(after)["is_success"])
             if terminated or after.step >= last:
@@ -178,16 +179,17 @@ class TeamWorld:
         self._begin()
         return ending
 
-    def _reward(self, terms: list[Earned]) -> float | Floats:
-        """One number for all, or (P,): a term with shares then gives each shepherd its own instead of their mean."""
-        if not self._plan.own_credit:
-            reward = 0.0
-            for term in terms:
-                reward += term.value
-            return reward
-        own = np.zeros(self.n_shepherds)
+    def _own(self, terms: list[Earned]) -> list[float]:
+        """Each shepherd's reward: the team's, or with its own share in place of the mean of a term that has shares.
+
+        Plain numbers: for a handful of shepherds arrays take longer.
+        """
+        own = [0.0] * self.n_shepherds
         for term in terms:
-            own += term.value if term.shares is None else term.weight * np.array(term.shares)
+            if self._plan.own_credit and term.shares is not None:
+                own = [total + term.weight * share for total, share in zip(own, term.shares, strict=True)]
+            else:
+                own = [total + term.value for total in own]
         return own
 
     def _look(self) -> Scan | None:
