@@ -72,6 +72,7 @@ class TeamWorld:
         rewards: (P,) float32 of the latest decision, written in place.
         returns: (P,) summed rewards of this episode.
         beam_offset: (P,) beams by which the observation is rolled.
+        seed: of this episode.
         clock: control steps by which this episode is shorter than its scenario says.
         decisions: made in this episode.
         decision_steps: control steps of the latest decision.
@@ -89,7 +90,7 @@ class TeamWorld:
         self.observation, self.rewards = observation, rewards
         self._plan = plan
         lidar, self._sets = scans_for(plan.scheme, plan.lidar)
-        self._scan_lidar = lidar or plan.lidar
+        self._scan_lidar = lidar or plan.lidar  # there is one, since something is observed
         self._stack = Stack(plan.lidar)
         self._held = HeldSuccess()
         self._world: World | None = None
@@ -122,6 +123,7 @@ class TeamWorld:
 
     def _begin(self) -> None:
         """Start the next episode."""
+        self.seed = int(self._seeds.integers(2**63))
         scenario = self._plan.scenario
         if not isinstance(scenario, Scenario):
             scenario = scenario(self._draws, self.index)
@@ -130,7 +132,7 @@ class TeamWorld:
             self._world = World(with_team(scenario, self.n_shepherds))
         elif self._world is None:
             self._world = World(with_team(scenario, self.n_shepherds))
-        self.world.reset(int(self._seeds.integers(2**63)))
+        self.world.reset(self.seed)
         self.clock = self.decisions = 0
         self.returns = np.zeros(self.n_shepherds)
         self.beam_offset = np.zeros(self.n_shepherds, dtype=np.int64)
@@ -192,7 +194,7 @@ class TeamWorld:
                 own = [total + term.value for total in own]
         return own
 
-    def _look(self) -> Scan | None:
+    def _look(self) -> Scan:
         """Scan, and take the frame into the stack."""
         scan = self.world.scan(self._scan_lidar, self._sets)
         self._stack.push(encode(scan, self._plan.lidar))
