@@ -24,7 +24,7 @@ from shepherd_phys.workers import birth, end_with_owner, explain
 
 from ._team_world import Ending, Plan, TeamWorld
 
-WORLD_COST = 4.0
+WORLD_COST = 7.0
 """What a control step of a world costs apart from its shepherds, each of whom costs 1 (measured, roughly)."""
 
 Answer = dict[int, Any]
@@ -32,7 +32,7 @@ Answer = dict[int, Any]
 
 
 class WorkerError(RuntimeError):
-    """A worker threw or died; the message says which, with which worlds, and why. The vector env is closed then."""
+    """A worker threw or died; the message says which and why. The vector env is closed then."""
 
 
 class Memory:
@@ -68,14 +68,17 @@ class Local:
 
     def do(self, order: str, *details: Any) -> Answer:
         """Carry out an order: "restart" (root, number), "decide" (); or for some worlds "get", "set" or "call"."""
-        if order == "restart":
-            for world in self.worlds.values():
-                world.restart(*details)
-            return {}
-        if order == "decide":
+        if order in {"restart", "decide"}:
             endings: dict[int, Ending] = {}
             for index, world in self.worlds.items():
-                ending = world.decide(self._actions[index])
+                try:
+                    if order == "restart":
+                        world.restart(*details)
+                        continue
+                    ending = world.decide(self._actions[index])
+                except Exception as error:
+                    error.add_note(f"in world {index}, episode seed {world.seed}")
+                    raise
                 self._steps[index] = world.decision_steps
                 if ending is not None:
                     endings[index] = ending
@@ -98,9 +101,6 @@ class Local:
     def answer(self) -> Answer:
         """Carry out the order that was given."""
         return self.do(*self._order)
-
-    def settle(self) -> None:
-        """Forget an order that was given and not carried out, or not to its end."""
 
     def close(self) -> None:
         """Nothing to end."""
@@ -142,7 +142,8 @@ class Crew:
         return self.answer()
 
     def give(self, order: str, *details: Any) -> None:
-        """Hand the order to all workers."""
+        """Hand the order to all workers; what an earlier, interrupted one still has to answer is forgotten."""
+        self._wait()
         if not self._workers:
             raise WorkerError("the vector env is closed")
         message = pickle.dumps((order, *details))
@@ -151,6 +152,13 @@ class Crew:
 
     def answer(self) -> Answer:
         """Wait until all workers have carried out the order. After Ctrl-C, asking again continues the wait."""
+        answer, refusal = self._wait()
+        if refusal is not None:
+            raise refusal
+        return answer
+
+    def _wait(self) -> tuple[Answer, BaseException | None]:
+        """Wait until no worker is busy: what the worlds said, and what one of them raised on a user's order."""
         refusal: BaseException | None = None
         try:
             while waiting := [worker for worker in self._workers if worker.busy]:
@@ -166,13 +174,7 @@ class Crew:
             self.close()
             raise
         answer, self._answer = self._answer, {}
-        if refusal is not None:
-            raise refusal
-        return answer
-
-    def settle(self) -> None:
-        """Let workers finish what they are at, and forget it."""
-        self.answer()
+        return answer, refusal
 
     def close(self) -> None:
         """End the workers; those in the middle of something are killed."""
@@ -198,7 +200,7 @@ class _Worker:
     """One process and its pipe, seen from the owner."""
 
     def __init__(self, context: Any, number: int, mine: list[int], pickled: bytes, memory: Memory) -> None:
-        self.name = f"worker {number} (worlds {', '.join(map(str, mine))})"
+        self.name = f"worker {number}"
         self.pipe, theirs = context.Pipe()
         self.process = context.Process(
             target=_serve,
@@ -208,8 +210,11 @@ class _Worker:
         )
         self.busy = True  # starting
         self._ready = self._torn = False
-        with birth():
-            self.process.start()
+        try:
+            with birth():
+                self.process.start()
+        except OSError as error:
+            raise WorkerError(f"{self.name}: cannot start ({error})") from error
         theirs.close()
 
     def send(self, message: bytes) -> None:
@@ -277,7 +282,11 @@ def _serve(
         try:
             reply = pickle.dumps(("done", worlds.do(order, *details)))
         except BaseException as error:
-            reply = _refusal(error) if order in {"get", "set", "call"} else pickle.dumps(("failed", explain(error)))
+            if order in {"get", "set", "call"}:
+                reply = _refusal(error)
+            else:
+                notes = getattr(error, "__notes__", [])
+                reply = pickle.dumps(("failed", ", ".join([explain(error), *notes])))
         try:
             pipe.send_bytes(reply)
         except OSError:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from shepherd_phys.lidar import Lidar, Scan, Stack, encode, turn
 from shepherd_phys.scenario import Scenario
 from shepherd_phys.settings import SettingsError
-from shepherd_phys.state import Floats, WorldState
+from shepherd_phys.state import WorldState
 from shepherd_phys.world import World
 
 from ._critic import N_NUMBERS, whole_world
@@ -72,6 +72,7 @@ class TeamWorld:
         rewards: (P,) float32 of the latest decision, written in place.
         returns: (P,) summed rewards of this episode.
         beam_offset: (P,) beams by which the observation is rolled.
+        seed: of this episode.
         clock: control steps by which this episode is shorter than its scenario says.
         decisions: made in this episode.
         decision_steps: control steps of the latest decision.
@@ -89,7 +90,7 @@ class TeamWorld:
         self.observation, self.rewards = observation, rewards
         self._plan = plan
         lidar, self._sets = scans_for(plan.scheme, plan.lidar)
-        self._scan_lidar = lidar or plan.lidar
+        self._scan_lidar = lidar or plan.lidar  # there is one, since something is observed
         self._stack = Stack(plan.lidar)
         self._held = HeldSuccess()
         self._world: World | None = None
@@ -122,6 +123,7 @@ class TeamWorld:
 
     def _begin(self) -> None:
         """Start the next episode."""
+        self.seed = int(self._seeds.integers(2**63))
         scenario = self._plan.scenario
         if not isinstance(scenario, Scenario):
             scenario = scenario(self._draws, self.index)
@@ -130,7 +132,7 @@ class TeamWorld:
             self._world = World(with_team(scenario, self.n_shepherds))
         elif self._world is None:
             self._world = World(with_team(scenario, self.n_shepherds))
-        self.world.reset(int(self._seeds.integers(2**63)))
+        self.world.reset(self.seed)
         self.clock = self.decisions = 0
         self.returns = np.zeros(self.n_shepherds)
         self.beam_offset = np.zeros(self.n_shepherds, dtype=np.int64)
@@ -154,13 +156,14 @@ class TeamWorld:
         action = turn(actions, self.beam_offset, plan.lidar.beams) if goal_frame else actions
         first = world.state.step
         last = min(first + plan.decision_interval, scenario.n_steps - self.clock)
-        summed = np.zeros(self.n_shepherds)
+        summed = [0.0] * self.n_shepherds
         terminated = False
         while True:
             before = world.state
             after = world.step(action)
             scan = self._look()
-            summed += self._reward(earned(plan.scheme, before, after, scan, scenario))
+            own = self._own(earned(plan.scheme, before, after, scan, scenario))
+            summed = [total + reward for total, reward in zip(summed, own, strict=True)]
             if scenario.terminate_on_success:
                 terminated = self._held(after, measures(after)["is_success"])
             if terminated or after.step >= last:
@@ -178,19 +181,20 @@ class TeamWorld:
         self._begin()
         return ending
 
-    def _reward(self, terms: list[Earned]) -> float | Floats:
-        """One number for all, or (P,): a term with shares then gives each shepherd its own instead of their mean."""
-        if not self._plan.own_credit:
-            reward = 0.0
-            for term in terms:
-                reward += term.value
-            return reward
-        own = np.zeros(self.n_shepherds)
+    def _own(self, terms: list[Earned]) -> list[float]:
+        """Each shepherd's reward: the team's, or with its own share in place of the mean of a term that has shares.
+
+        Plain numbers: for a handful of shepherds arrays take longer.
+        """
+        own = [0.0] * self.n_shepherds
         for term in terms:
-            own += term.value if term.shares is None else term.weight * np.array(term.shares)
+            if self._plan.own_credit and term.shares is not None:
+                own = [total + term.weight * share for total, share in zip(own, term.shares, strict=True)]
+            else:
+                own = [total + term.value for total in own]
         return own
 
-    def _look(self) -> Scan | None:
+    def _look(self) -> Scan:
         """Scan, and take the frame into the stack."""
         scan = self.world.scan(self._scan_lidar, self._sets)
         self._stack.push(encode(scan, self._plan.lidar))

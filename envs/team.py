@@ -127,9 +127,9 @@ class TeamVecEnv(VecEnv):
         _one_of("credit", credit, ("team", "own"))
         _one_of("critic", critic, ("own", "world"))
         _one_of("render_mode", render_mode, (None, "rgb_array"))
+        if not isinstance(team_sizes, Sequence | np.ndarray) or not len(team_sizes):
+            raise SettingsError(f"team_sizes: needs one number or more, one a world (given: {team_sizes!r})")
         self.team_sizes = tuple(_whole(f"team_sizes[{i}]", size, 1) for i, size in enumerate(team_sizes))
-        if not self.team_sizes:
-            raise SettingsError("team_sizes: needs one number or more (given: none)")
         self.lidar = lidar
         self.decision_interval = _whole("decision_interval", decision_interval, 1)
         self.n_workers = _whole("n_workers", n_workers, 0)
@@ -188,8 +188,7 @@ class TeamVecEnv(VecEnv):
             number: of the restart, not negative.
         """
         number = _whole("number", number, 0)
-        self._crew.settle()
-        self._pending = False
+        self._pending = self._started = False
         self._crew.do("restart", self.root, number)
         self._number, self._started = number, True
         return self._observation()
