@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from shepherd_phys.scenario import SUCCESS_FRACTION
 from shepherd_phys.state import WorldState
+from shepherd_phys.workers import explain
 
 from .base import Controller
 from .learned import Policy
@@ -155,6 +156,8 @@ def checked_controller(controller: Any) -> Controller:
         except TypeError as error:
             name = name_of(controller)
             raise ControllerError(f"controller {name}: cannot be made without arguments ({error})") from None
+        except Exception as error:
+            raise ControllerError(f"controller {name_of(controller)}: cannot be made: {explain(error)}") from None
     lacking = [name for name in ("reset", "act") if not callable(getattr(controller, name, None))]
     if not hasattr(controller, "lidar"):
         lacking.insert(0, "lidar")

@@ -109,6 +109,11 @@ def summary_columns(labels: Sequence[str] = LABELS, metrics: Sequence[str] = MET
     return (*labels, "trials", *(f"{name}_{part}" for name in metrics for part in ("mean", "low", "high")))
 
 
+def difference_columns(labels: Sequence[str] = LABELS, metrics: Sequence[str] = METRICS) -> tuple[str, ...]:
+    """Columns of ``differences.csv``."""
+    return *labels, "baseline", *summary_columns((), [f"{name}_diff" for name in metrics])
+
+
 _Labels = tuple[tuple[str, Any], ...]
 
 

@@ -30,6 +30,7 @@ from shepherd_phys.world import World
 
 from .impacts import impacts
 from .plain import PlainWorld
+from .throughput import throughput
 
 SEED = 0
 """Root seed of the episodes that are timed (tuning seeds)."""
@@ -51,6 +52,10 @@ class Arguments:
     """Instead: N impacts of sheep and shepherds, alone and pushed, on the thinnest walls and small pillars."""
     engine: bool = False
     """Instead: compare numbers of substeps and iterations by cost, overlap and impacts."""
+    campaign: bool = False
+    """Instead: episodes a second of a campaign with one worker and with two."""
+    seeds: Annotated[int, tyro.conf.arg(metavar="N")] = 4
+    """Episodes of each controller that a run of --campaign counts."""
 
 
 class Stopwatch:
@@ -275,7 +280,7 @@ def machine() -> str:
 def main(argv: list[str]) -> int:
     """Run the command."""
     args = tyro.cli(Arguments, prog="shepherd-phys benchmark", args=argv)
-    for name in ("runs", "steps"):
+    for name in ("runs", "steps", "seeds"):
         if getattr(args, name) < 1:
             print(f"--{name}: must be at least 1 (given: {getattr(args, name)})", file=sys.stderr)
             return 2
@@ -283,7 +288,9 @@ def main(argv: list[str]) -> int:
         print(f"--impacts: must not be negative (given: {args.impacts})", file=sys.stderr)
         return 2
     result: Any
-    if args.engine:
+    if args.campaign:
+        result = throughput(args.runs, args.seeds)
+    elif args.engine:
         result = compare_engines(args.runs, args.steps, args.impacts or 5_000)
     elif args.impacts:
         result = impacts(args.impacts, seed=SEED)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import io
 import json
 import os
@@ -24,18 +23,16 @@ from rich.table import Table
 
 from shepherd_phys import __version__, campaign
 from shepherd_phys.campaign import CampaignError, Ledger
-from shepherd_phys.controllers.evaluation import LABELS, ControllerError, run_episode, trial_seed
+from shepherd_phys.cluster import Cluster
+from shepherd_phys.controllers.evaluation import LABELS, ControllerError, trial_seed
 from shepherd_phys.envs.shepherding import ShepherdingEnv
 from shepherd_phys.scenario import SCENARIOS
 from shepherd_phys.settings import SettingsError, read_toml
-from shepherd_phys.workers import explain
 
-from .points import Point, episode, find_controller, place, points, table, tasks, write_tables
+from .pictures import picture
+from .points import episode, place, points, table, tasks, write_tables
 
 PROG = "shepherd-phys evaluate"
-PICTURE = "episode.png"
-PICTURE_SIZE = (900, 900)
-"""[px]."""
 LOG_SECONDS = 30.0
 """Progress is a line so often where standard error is no terminal [s]."""
 
@@ -55,8 +52,9 @@ def _flag(metavar: str, default: str | None = None) -> Any:
 class Evaluate:
     """Run controllers headless over the full cross product of the lists given, and write the tables.
 
-    Writes episodes.csv (one row an episode), summary.csv (means with 95 % bootstrap intervals) and episode.png into the
-    folder --out, with a ledger that lets a stopped campaign continue: give the same command again.
+    Writes episodes.csv (one row an episode), summary.csv (means with 95 % bootstrap intervals), differences.csv (paired
+    differences from a baseline, where there are several controllers) and episode.png into the folder --out, with a
+    ledger that lets a stopped campaign continue: give the same command again.
     """
 
     controllers: Annotated[tuple[str, ...], _flag("NAME ..")] = ("strombom",)
@@ -75,6 +73,8 @@ class Evaluate:
     """Body of every shepherd; those that the file describes as such keep their parameters."""
     flock: Annotated[str | None, _flag("NAME|module:Name", "the scenario's")] = None
     """Flock model; if the file describes such a one, with its parameters."""
+    baseline: Annotated[str | None, _flag("NAME", "the first of --controllers")] = None
+    """The controller from which the others' differences are told, paired by seed."""
     trials: Annotated[int, _flag("T")] = 100
     """Episodes a point."""
     seed: Annotated[int, _flag("S")] = 20_000
@@ -85,15 +85,20 @@ class Evaluate:
     """Run only the I-th of N equal parts (1-based), for machines that share nothing."""
     workers: Annotated[int, _flag("W")] = cpu_count()
     """Worker processes; the results do not depend on it."""
+    scheduler: Annotated[str | None, _flag("ADDRESS", "")] = None
+    """Instead of --workers: the scheduler of a Dask cluster, e.g. tcp://10.0.0.1:8786."""
     timeout: Annotated[float, _flag("SECONDS")] = 600.0
     """An episode that takes longer counts as hung."""
     out: Annotated[Path, _flag("DIR")] = Path("results")
     """Folder for tables and ledger; an unfinished campaign in it is continued."""
+    gather: Annotated[tuple[Path, ...], _flag("DIR ..", "")] = ()
+    """Folders of other campaigns, such as shards: episodes that they have are taken over and not run."""
     json: tyro.conf.FlagCreatePairsOff[bool] = False
     """Print the summary as one JSON array, and nothing else, on standard output."""
 
 
-GRID_KEYS = ("controllers", "flocks", "cohesion", "shepherds", "sheep", "scenario", "body", "flock", "trials", "seed")
+POINT_KEYS = ("controllers", "flocks", "cohesion", "shepherds", "sheep", "scenario", "body", "flock")
+GRID_KEYS = (*POINT_KEYS, "baseline", "trials", "seed")
 LISTS = {"controllers": str, "flocks": int, "cohesion": int, "shepherds": int}
 WANTED = dict.fromkeys(("flocks", "cohesion", "shepherds"), "whole numbers")
 WANTED |= dict.fromkeys(("sheep", "trials", "seed", "workers"), "a whole number") | {"timeout": "a number of seconds"}
@@ -114,24 +119,24 @@ def main(argv: Sequence[str]) -> int:
 def _main(options: Evaluate, out: TextIO) -> int:
     try:
         part, count = read_shard(options.shard)
-        grid = points(**{name: getattr(options, name) for name in GRID_KEYS if name not in ("trials", "seed")})
+        grid = points(**{name: getattr(options, name) for name in POINT_KEYS})
         seeds = [trial_seed(options.seed, trial) for trial in range(options.trials)]
         todo = campaign.shard(tasks(grid, seeds), part, count)
     except (SettingsError, ControllerError) as error:
         return _fail(error, 2)
     with progress_bar() as report:
         try:
-            ledger = ready(options.out, todo)
+            ledger = ready(options.out, todo, options.gather)
         except (SettingsError, CampaignError) as error:
             return _fail(error, 2)
         with ledger:
             try:
                 outcome = campaign.run(
-                    todo, episode, workers=options.workers, ledger=ledger, timeout=options.timeout, report=report
+                    todo, episode, workers=workforce(options), ledger=ledger, timeout=options.timeout, report=report
                 )
-                summary, paths = write_tables(options.out, table(todo, outcome))
+                summary, paths = write_tables(options.out, table(todo, outcome), options.baseline)
                 if todo and outcome.rows[0] is not None:
-                    paths += picture(todo[0], ledger)
+                    paths += picture(todo[0], ledger, PROG)
             except CampaignError as error:
                 return _fail(error, 1)
             except KeyboardInterrupt:
@@ -140,6 +145,7 @@ def _main(options: Evaluate, out: TextIO) -> int:
         print(json.dumps(summary, allow_nan=False, indent=1), file=out)
     else:
         print_table(summary, out)
+        print_differences(summary, out)
     for path in paths:
         print(path, file=sys.stderr if options.json else out)
     for failure in outcome.failures:
@@ -147,20 +153,30 @@ def _main(options: Evaluate, out: TextIO) -> int:
     return 1 if outcome.failures else 0
 
 
-def ready(folder: Path, todo: Sequence[campaign.Task]) -> Ledger:
-    """The folder's ledger, when what it does not hold yet has been rehearsed.
+def workforce(options: Evaluate) -> int | campaign.Hire:
+    """Who does the work."""
+    if options.scheduler is None:
+        return options.workers
+    return partial(Cluster, address=options.scheduler, say=lambda text: print(f"{PROG}: {text}", file=sys.stderr))
+
+
+def ready(folder: Path, todo: Sequence[campaign.Task], sources: Sequence[Path] = ()) -> Ledger:
+    """The folder's ledger with what other folders have, when what is still to be run has been rehearsed.
 
     Raises:
         SettingsError: no world can be placed for a point. No folder has been made then.
-        CampaignError: the folder is not to be had.
+        CampaignError: the folder is not to be had, or nothing can be gathered from a source.
     """
-    if not (folder / campaign.LEDGER).exists():
-        rehearse(todo)
-        return Ledger(folder, __version__)
+    taken = campaign.gathered(sources, __version__, todo)
+    is_new = not (folder / campaign.LEDGER).exists()
+    if is_new:
+        rehearse([task for task in todo if task.key not in taken])
     ledger = Ledger(folder, __version__)
     try:
-        kept = ledger.rows(task.settings_hash for task in todo)
-        rehearse([task for task in todo if task.key not in kept])
+        ledger.take(taken)
+        if not is_new:
+            kept = ledger.rows(task.settings_hash for task in todo)
+            rehearse([task for task in todo if task.key not in kept])
     except BaseException:
         ledger.close()
         raise
@@ -209,9 +225,11 @@ def read_options(argv: Sequence[str]) -> Evaluate:
         raise SettingsError(f"{problem}{''.join(wanted[:1])} (see {PROG} --help)") from None
     flags = {f.name for f in fields(Evaluate) if any(a == f"--{f.name}" or a.startswith(f"--{f.name}=") for a in argv)}
     values = {f.name: getattr(options, f.name) for f in fields(Evaluate)}
-    for name in LISTS:
+    for name in (*LISTS, "gather"):
         if name in flags and not values[name]:
             raise SettingsError(f"--{name}: needs at least one value")
+    if {"workers", "scheduler"} <= flags:
+        raise SettingsError("--workers and --scheduler: the workers are the cluster's then; leave one of the two out")
     if options.grid is not None:
         for name, value in read_grid(options.grid).items():
             if name in flags:
@@ -223,6 +241,10 @@ def read_options(argv: Sequence[str]) -> Evaluate:
                 raise SettingsError(f"{name}: {number} is impossible; it must be at least {least}")
     if not values["timeout"] > 0:
         raise SettingsError(f"timeout: {values['timeout']} is impossible; it must be above 0 s")
+    controllers = tuple(dict.fromkeys(values["controllers"]))
+    if values["baseline"] not in (None, *controllers):
+        raise SettingsError(f"baseline: {values['baseline']!r} is not among the controllers ({', '.join(controllers)})")
+    values["baseline"] = (values["baseline"] or controllers[0]) if len(controllers) > 1 else None
     return Evaluate(**values)
 
 
@@ -278,17 +300,32 @@ def _one_line(box: str) -> str:
     return " ".join(" ".join(message).split())
 
 
+METRICS = {
+    "in_goal_end": ("in at the end %", ".1f"),
+    "path_length": ("path m", ".0f"),
+    "time_to_95": ("95 % in after s", ".0f"),
+}
+"""What matters most, its title and its format."""
+
+
 def print_table(summary: Sequence[Mapping[str, Any]], out: TextIO) -> None:
     """Print what matters most of the summary; what is the same in all rows stands above it."""
-    metrics = {
-        "in_goal_end": ("in at the end %", ".1f"),
-        "path_length": ("path m", ".0f"),
-        "time_to_95": ("95 % in after s", ".0f"),
-    }
-    labels = [name for name in (*LABELS, "trials") if name == "controller" or len({row[name] for row in summary}) > 1]
-    same = [f"{name} {summary[0][name]}" for name in (*LABELS, "trials") if summary and name not in labels]
+    _print_rows(summary, "mean [95 % bootstrap interval]", "", out)
+
+
+def print_differences(summary: Sequence[Mapping[str, Any]], out: TextIO) -> None:
+    """Print what matters most of the differences from the baseline, where there are any."""
+    rows = [{**row, **row["differences"]} for row in summary if row["differences"] is not None]
+    if rows:
+        _print_rows(rows, f"difference from {rows[0]['baseline']} on the same seeds", "_diff", out)
+
+
+def _print_rows(rows: Sequence[Mapping[str, Any]], title: str, suffix: str, out: TextIO) -> None:
+    sign = "+" if suffix else ""
+    labels = [name for name in (*LABELS, "trials") if name == "controller" or len({row[name] for row in rows}) > 1]
+    same = [f"{name} {rows[0][name]}" for name in (*LABELS, "trials") if rows and name not in labels]
     grid = Table(
-        title="\n".join([", ".join(same), "mean [95 % bootstrap interval]"]),
+        title="\n".join([", ".join(same), title]),
         title_justify="left",
         box=SIMPLE_HEAD,
         padding=(0, 1, 0, 0),
@@ -296,15 +333,16 @@ def print_table(summary: Sequence[Mapping[str, Any]], out: TextIO) -> None:
     )
     for name in labels:
         grid.add_column(name.removeprefix("n_"), justify="left" if name in ("controller", "scenario") else "right")
-    for title, _ in metrics.values():
-        grid.add_column(title, justify="right", no_wrap=True)
-    for row in summary:
+    for heading, _ in METRICS.values():
+        grid.add_column(heading, justify="right", no_wrap=True)
+    for row in rows:
+        numbers = [
+            [f"{row[f'{n}{suffix}_{part}']:{sign}{f}}" for part in ("mean", "low", "high")]
+            for n, (_, f) in METRICS.items()
+        ]
         grid.add_row(
             *("" if row[name] is None else str(row[name]) for name in labels),
-            *(
-                f"{row[f'{n}_mean']:{f}} [{row[f'{n}_low']:{f}}, {row[f'{n}_high']:{f}}]"
-                for n, (_, f) in metrics.items()
-            ),
+            *(f"{mean} [{low}, {high}]" for mean, low, high in numbers),
         )
     console = Console(file=out, markup=False, highlight=False)
     if not console.is_terminal:
@@ -354,41 +392,3 @@ def _clock(seconds: float) -> str:
     minutes, seconds = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{seconds:02d}"
-
-
-def picture(task: campaign.Task, ledger: Ledger) -> list[Path]:
-    """Draw how a task's episode ended beside the ledger, unless that picture is there; its path, if there is one."""
-    path = ledger.folder / PICTURE
-    if importlib.util.find_spec("pygame") is None:
-        print(f"{PROG}: no {PICTURE}: pygame-ce is missing (pip install 'shepherd-phys[render]')", file=sys.stderr)
-        return []
-    drawn = f"{task.settings_hash} {task.seed}"
-    if path.exists() and ledger.note(PICTURE) == drawn:
-        return [path]
-    try:
-        draw_episode(task.spec, task.seed, path)
-    except Exception as error:  # the tables do not hang on a picture
-        print(f"{PROG}: no {PICTURE}: {explain(error)}", file=sys.stderr)
-        return []
-    ledger.leave_note(PICTURE, drawn)
-    return [path]
-
-
-def draw_episode(point: Point, seed: int, path: Path) -> None:
-    """Run an episode again in this process and draw its end, with trails and where the sheep began."""
-    from shepherd_phys.render import save_png
-
-    controller = find_controller(point.controller)
-    make_env = partial(
-        ShepherdingEnv,
-        point.scenario,
-        render_mode="rgb_array",
-        render_size=PICTURE_SIZE,
-        trail_steps=point.scenario.n_steps,
-    )
-    env = make_env(rewards={}, lidar=controller.lidar)
-    run_episode(controller, env, seed)
-    drawn = env.render()
-    env.close()
-    if drawn is not None:
-        save_png(drawn, path)

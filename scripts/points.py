@@ -12,7 +12,7 @@ import inspect
 import itertools
 import os
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -20,21 +20,30 @@ from typing import Any
 
 from shepherd_phys import __version__
 from shepherd_phys.bodies import BODIES, Body, Disc
-from shepherd_phys.campaign import Outcome, Task, settings_hash, write_csv
+from shepherd_phys.campaign import Outcome, Task, settings_hash, write_csv, write_parquet
 from shepherd_phys.controllers import CONTROLLERS, Controller, Policy, load_policy
 from shepherd_phys.controllers.evaluation import (
     COLUMNS,
+    LABELS,
     ControllerError,
     checked_controller,
     evaluate,
     parameters_of,
 )
-from shepherd_phys.controllers.summary import summarise, summary_columns
+from shepherd_phys.controllers.summary import difference_columns, paired_differences, summarise, summary_columns
 from shepherd_phys.envs.shepherding import ShepherdingEnv
 from shepherd_phys.flock import FLOCKS, FlockModel
 from shepherd_phys.scenario import Scenario, load_scenario
 from shepherd_phys.settings import SettingsError, kind_of
 from shepherd_phys.workers import explain
+
+KINDS: dict[str, type] = {
+    **dict.fromkeys(COLUMNS, float),
+    **dict.fromkeys(("controller", "scenario", "settings_hash", "version"), str),
+    **dict.fromkeys(("n_flocks", "cohesion", "n_shepherds", "n_sheep", "seed", "collisions", "steps"), int),
+    **dict.fromkeys(("reached_95", "success"), bool),
+}
+"""Of the columns of ``episodes.parquet``."""
 
 
 @dataclass(frozen=True)
@@ -191,13 +200,39 @@ def table(tasks: Sequence[Task], outcome: Outcome) -> list[dict[str, Any]]:
     return sorted(rows, key=lambda row: tuple(_sortable(row[name]) for name in COLUMNS))
 
 
-def write_tables(folder: Path, rows: Sequence[dict[str, Any]]) -> tuple[list[dict[str, Any]], list[Path]]:
-    """Write ``episodes.csv`` and ``summary.csv``; the summary's rows and the two paths."""
+def write_tables(
+    folder: Path, rows: Sequence[dict[str, Any]], baseline: str | None = None
+) -> tuple[list[dict[str, Any]], list[Path]]:
+    """Write ``episodes.csv``, with polars ``episodes.parquet``, ``summary.csv``, and ``differences.csv``.
+
+    A table that earlier rows left there and that is not written now is removed.
+
+    Args:
+        folder: where to.
+        rows: of `table`.
+        baseline: the controller with which the others are compared; without one there are no differences.
+
+    Returns:
+        the summary's rows, each with its ``differences`` from the baseline (None where there are none), and the paths.
+
+    Raises:
+        CampaignError: a file cannot be written.
+    """
     summary = summarise(rows)
-    paths = [folder / "episodes.csv", folder / "summary.csv"]
-    write_csv(paths[0], COLUMNS, rows)
-    write_csv(paths[1], summary_columns(), summary)
-    return summary, paths
+    paired = baseline is not None and any(row["controller"] == baseline for row in rows)
+    differences = paired_differences(rows, baseline) if baseline is not None and paired else []
+    told = {_labels(row): {name: row[name] for name in row if name not in LABELS} for row in differences}
+    write_csv(folder / "episodes.csv", COLUMNS, rows)
+    written = {"episodes.csv": True, "episodes.parquet": write_parquet(folder / "episodes.parquet", KINDS, rows)}
+    write_csv(folder / "summary.csv", summary_columns(), summary)
+    written |= {"summary.csv": True, "differences.csv": baseline is not None}
+    if baseline is not None:
+        write_csv(folder / "differences.csv", difference_columns(), differences)
+    for name, is_new in written.items():
+        if not is_new:
+            (folder / name).unlink(missing_ok=True)
+    paths = [folder / name for name, is_new in written.items() if is_new]
+    return [{**row, "differences": told.get(_labels(row))} for row in summary], paths
 
 
 def find_controller(name: str) -> Controller:
@@ -216,6 +251,8 @@ def find_controller(name: str) -> Controller:
                 own = own()
             except TypeError as error:
                 raise ControllerError(f"controllers: {name}: cannot be called without arguments ({error})") from None
+            except Exception as error:
+                raise ControllerError(f"controllers: {name}: cannot be made: {explain(error)}") from None
         return checked_controller(own)
     if name not in CONTROLLERS:
         raise SettingsError(
@@ -254,7 +291,7 @@ def imported(name: str, where: str) -> Any:
         sys.path.append(os.getcwd())  # at the end: it must not hide an installed package, ours in a checkout included
     try:
         module = importlib.import_module(module_name)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise SettingsError(f"{where}: {name}: module {module_name!r} cannot be imported: {explain(error)}") from None
     if not hasattr(module, attribute):
         raise SettingsError(f"{where}: {name}: module {module_name!r} has no {attribute!r}")
@@ -282,6 +319,10 @@ def _made(cls: type[Any], protocol: type[Any], where: str) -> Any:
         raise SettingsError(
             f"{where}: cannot be made without arguments ({error}); a scenario file can give them"
         ) from None
+    except SettingsError:
+        raise
+    except Exception as error:
+        raise SettingsError(f"{where}: cannot be made: {explain(error)}") from None
     lacking = [member for member in vars(protocol) if not member.startswith("_") and not hasattr(made, member)]
     if lacking:
         raise SettingsError(f"{where}: lacks {', '.join(lacking)}")
@@ -307,3 +348,7 @@ def _team(scenario: Scenario, n: int, default: Any) -> tuple[Any, ...]:
 
 def _sortable(value: Any) -> tuple[int, Any]:
     return (0, 0) if value is None else (1, value)
+
+
+def _labels(row: Mapping[str, Any]) -> tuple[Any, ...]:
+    return tuple(row[name] for name in LABELS)

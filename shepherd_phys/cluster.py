@@ -29,6 +29,8 @@ CONNECT_SECONDS = 10.0
 """A scheduler that has not answered by then is not there [s]."""
 LOOK_SECONDS = 1.0
 """Workers that come and go are noticed within this time [s]."""
+LOST_SECONDS = 60.0
+"""A scheduler that does not answer for so long is lost, even if its machine still holds the connection [s]."""
 RESTART_SECONDS = 20.0
 """For the restart of a hanging worker [s]."""
 PATIENCE_SECONDS = 15.0
@@ -39,10 +41,10 @@ QUEUE = 1
 
 @dataclass(eq=False)
 class _Sent:
-    """A job, and how long it may still take."""
+    """A job, and until when it may take."""
 
     job: Job
-    work: bytes
+    pickled: bytes
     future: Any = None
     deadline: float = float("inf")
 
@@ -91,6 +93,7 @@ class Cluster:
         self._say = say
         self._client: Any = None
         self._sites: dict[str, _Site] = {}
+        self._restarting: set[str] = set()
         self._homeless: deque[_Sent] = deque()
         self._news: queue.SimpleQueue[tuple[_Site, _Sent | None, Any]] = queue.SimpleQueue()
         self._looked = 0.0
@@ -194,13 +197,15 @@ class Cluster:
     def _look(self, late: bool) -> list[Ended]:
         """Notice workers that came and went; the jobs that went with them."""
         try:
-            seen = self._client.sync(self._client.scheduler.identity, n_workers=-1, callback_timeout=CONNECT_SECONDS)
+            seen = self._client.sync(self._client.scheduler.identity, n_workers=-1, callback_timeout=LOST_SECONDS)
         except Exception:
             raise self._lost() from None
         self._looked = time.monotonic()
         gone = [site for address, site in self._sites.items() if address not in seen["workers"]]
         ended = [end for site in gone for end in self._bury(site)]
         for address, worker in seen["workers"].items():
+            if address in self._restarting:
+                continue
             if address not in self._sites:
                 site = self._sites[address] = _Site(address, max(1, worker["nthreads"]), late)
                 site.greeting = self._submit(site, None, _greeting(), self._work)
@@ -228,9 +233,19 @@ class Cluster:
             ]
             self._leave(site, [sent for sent in site.sent if sent.deadline > now])
         if hanging:
-            with suppress(Exception):  # then it is greeted again, and does not answer until it can
-                self._client.restart_workers([s.address for s in hanging], RESTART_SECONDS, raise_for_error=False)
+            self._restart({site.address for site in hanging})
         return ended
+
+    def _restart(self, addresses: set[str]) -> None:
+        """Have workers' processes ended, and begun anew where a nanny does that; it takes seconds."""
+        self._restarting |= addresses
+
+        def restart() -> None:
+            with suppress(Exception):  # then they are greeted again, and answer when they can
+                self._client.restart_workers(list(addresses), RESTART_SECONDS, raise_for_error=False)
+            self._restarting -= addresses
+
+        threading.Thread(target=restart, daemon=True).start()
 
     def _leave(self, site: _Site, innocent: list[_Sent]) -> None:
         """Give up a worker; jobs that lost nothing by it look for another."""
@@ -243,7 +258,7 @@ class Cluster:
     def _send(self, sent: _Sent) -> None:
         site = max(self._sites.values(), key=lambda site: site.room)
         site.sent.append(sent)
-        sent.future = self._submit(site, sent, _doing(), self._work, sent.work)
+        sent.future = self._submit(site, sent, _doing(), self._work, sent.pickled)
         self._start_clocks(site)
 
     def _submit(self, site: _Site, sent: _Sent | None, function: Any, *arguments: bytes) -> Any:
@@ -257,11 +272,15 @@ class Cluster:
             retries=0,
             fifo_timeout=0,
         )
-        future.add_done_callback(partial(self._fetch, site, sent))
+        future.add_done_callback(partial(self._done, site, sent))
         return future
 
+    def _done(self, site: _Site, sent: _Sent | None, future: Any) -> None:
+        # Dask has one thread for all callbacks, and what a worker did that has died since may be looked for half a
+        # minute: nobody else should wait for that
+        threading.Thread(target=self._fetch, args=(site, sent, future), daemon=True).start()
+
     def _fetch(self, site: _Site, sent: _Sent | None, future: Any) -> None:
-        """In a thread of Dask's."""
         try:
             result = future.result()
         except BaseException as error:
@@ -286,7 +305,8 @@ class Cluster:
             return
         text = ""
         if all(site.unfit for site in self._sites.values()):
-            text = f"scheduler {self._address} has no workers; waiting for one to join"
+            able = " that can do the work" if self._sites else ""
+            text = f"scheduler {self._address} has no workers{able}; waiting for one to join"
         elif now - self._idle_since > PATIENCE_SECONDS:
             text = f"none of the workers of {self._address} has answered yet; waiting"
         if text and text != self._said:

@@ -214,6 +214,8 @@ def untagged(table: Mapping[str, Any], known: Mapping[str, Callable[..., Any]], 
             raise
         except (TypeError, ValueError) as error:
             raise SettingsError(f"{where}: {kind}: {error}") from None
+        except Exception as error:  # a user's class may raise anything
+            raise SettingsError(f"{where}: {kind}: {type(error).__name__}: {error}") from None
     if ":" in kind:
         return Foreign(kind, values)
     raise SettingsError(f"{where}.kind: unknown kind {kind!r}; known: {', '.join(sorted(known))}")

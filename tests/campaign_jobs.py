@@ -41,6 +41,12 @@ def faulty_row(spec, seed):
     return row(spec, seed)
 
 
+def hanging_row(spec, seed):
+    if seed == 33:
+        time.sleep(1000)
+    return row(spec, seed)
+
+
 def leaving_row(spec, seed):
     sys.exit("I leave")
 

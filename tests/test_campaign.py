@@ -15,7 +15,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shepherd_phys import campaign, workers
-from shepherd_phys.campaign import CampaignError, Ledger, Task, run, settings_hash, shard, write_csv
+from shepherd_phys.campaign import (
+    CampaignError,
+    Ledger,
+    Task,
+    gathered,
+    run,
+    settings_hash,
+    shard,
+    write_csv,
+    write_parquet,
+)
 
 
 def run_in(folder, todo, work, n_workers, **options):
@@ -323,6 +333,90 @@ def test_notes(tmp_path):
         assert ledger.note("a") == "c"
 
 
+# ---- rows of other folders ----------------------------------------------------------------------------------------
+
+
+def gather_into(folder, sources, todo):
+    taken = gathered([Path(source) for source in sources], "1", todo)
+    with Ledger(folder, "1") as ledger:
+        ledger.take(taken)
+    return taken
+
+
+def test_shards_gathered_are_the_whole(tmp_path):
+    todo = jobs.tasks(11)
+    run_in(tmp_path / "whole", todo, jobs.row, 0)
+    for i in (1, 2):
+        run_in(tmp_path / str(i), shard(todo, i, 2), jobs.row, 0)
+    before = [contents(tmp_path / name) for name in "12"]
+    assert len(gather_into(tmp_path / "all", [tmp_path / "1", tmp_path / "2"], todo)) == 11
+    assert [contents(tmp_path / name) for name in "12"] == before
+    assert run_in(tmp_path / "all", todo, jobs.row, 0).computed == 0
+    assert (tmp_path / "all" / "episodes.csv").read_bytes() == (tmp_path / "whole" / "episodes.csv").read_bytes()
+
+
+def test_only_the_rows_asked_for_are_gathered(tmp_path):
+    run_in(tmp_path / "a", jobs.tasks(9) + jobs.tasks(2, "b"), jobs.row, 0)
+    assert set(gathered([tmp_path / "a"], "1", jobs.tasks(3))) == {("hash-a", seed) for seed in range(3)}
+
+
+ADD_THREE = """
+import os, sys
+sys.path.insert(0, sys.argv[1])
+import campaign_jobs as jobs
+from shepherd_phys.campaign import Ledger
+ledger = Ledger(sys.argv[2], "1")
+for task in jobs.tasks(3):
+    ledger.add(task, "{}")
+print("done", flush=True)
+sys.stdin.read()
+os._exit(1)  # as if it were killed
+"""
+
+
+@pytest.mark.parametrize("then", ["at work", "killed", "killed, and copied without the index"])
+def test_rows_that_are_only_in_the_log_of_another_run_are_gathered(tmp_path, then):
+    command = [sys.executable, "-c", ADD_THREE, str(Path(jobs.__file__).parent), str(tmp_path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout.readline() == "done\n"
+        if then != "at work":
+            other.communicate()
+        if "without" in then:
+            (tmp_path / "ledger.sqlite-shm").unlink()
+        before = contents(tmp_path)
+        assert before["ledger.sqlite-wal"]
+        assert len(gathered([tmp_path], "1", jobs.tasks(3))) == 3
+        assert contents(tmp_path) == before
+
+
+def test_what_cannot_be_gathered_is_one_error_and_changes_nothing(tmp_path):
+    todo = jobs.tasks(2)
+    run_in(tmp_path / "a", todo, jobs.row, 0)
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / campaign.LEDGER).write_bytes(b"dear diary" * 100)
+    Ledger(tmp_path / "c", "2").close()
+    for name, message in (
+        ("nowhere", "nowhere: has no ledger to gather from"),
+        ("b", "is not a ledger of shepherd_phys"),
+        ("c", "holds rows of shepherd_phys 2, this is 1"),
+    ):
+        with pytest.raises(CampaignError, match=message):
+            gathered([tmp_path / "a", tmp_path / name], "1", todo)
+    assert not (tmp_path / "nowhere").exists()
+
+
+def test_two_results_of_one_episode_are_an_error_and_nothing_is_taken(tmp_path):
+    todo = jobs.tasks(3)
+    run_in(tmp_path / "a", todo, jobs.row, 0)
+    with Ledger(tmp_path / "b", "1") as ledger:
+        ledger.add(todo[2], '{"x": 1}')
+    with pytest.raises(CampaignError, match="another result for seed 2 of settings hash-a than was found elsewhere"):
+        gathered([tmp_path / "a", tmp_path / "b"], "1", todo)
+    with pytest.raises(CampaignError, match="another result for seed 2"):
+        gather_into(tmp_path / "b", [tmp_path / "a"], todo)
+    assert len(ledger_rows(tmp_path / "b")) == 1
+
+
 # ---- a full disk --------------------------------------------------------------------------------------------------
 
 
@@ -353,6 +447,32 @@ def test_a_table_that_cannot_be_written_leaves_the_old_one(tmp_path, monkeypatch
     assert contents(tmp_path) == {"t.csv": b"a\n1\n"}
 
 
+@pytest.mark.parametrize("room", [60_000, 200_000])
+def test_a_disk_that_fills_up_while_rows_are_written_is_one_error(tmp_path, room):
+    """A file may not grow beyond ``room`` bytes; the log of the ledger hits that."""
+    code = f"""
+import resource, signal, sys
+sys.path.insert(0, {str(Path(jobs.__file__).parent)!r})
+import campaign_jobs as jobs
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, ({room}, {room}))
+from shepherd_phys.campaign import CampaignError, Ledger, run
+try:
+    with Ledger({str(tmp_path)!r}, "1") as ledger:
+        run(jobs.tasks(500), jobs.row, workers=0, ledger=ledger)
+except CampaignError as error:
+    print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.stderr == ""
+    assert f"{tmp_path / campaign.LEDGER}: " in done.stdout
+    assert "every earlier row is kept" in done.stdout
+    assert done.stdout.count("\n") == 1
+    kept = len(ledger_rows(tmp_path))
+    assert 0 < kept < 500
+    assert run_in(tmp_path, jobs.tasks(500), jobs.row, 0).computed == 500 - kept
+
+
 def test_a_table_that_lacks_a_column_leaves_nothing_behind(tmp_path):
     with pytest.raises(KeyError):
         write_csv(tmp_path / "t.csv", ["a"], [{"a": 1}, {}])
@@ -372,6 +492,31 @@ def test_seeds_of_63_bits_have_a_place_in_the_ledger(tmp_path):
 def test_cells(tmp_path):
     write_csv(tmp_path / "t.csv", "abcde", [{"a": 0.1 + 0.2, "b": True, "c": None, "d": 3, "e": "x,y"}])
     assert (tmp_path / "t.csv").read_text() == 'a,b,c,d,e\n0.30000000000000004,true,,3,"x,y"\n'
+
+
+def test_parquet_has_kinds_and_is_the_same_every_time(tmp_path):
+    polars = pytest.importorskip("polars")
+    kinds = {"a": float, "b": bool, "c": int, "d": int, "e": str}
+    row = {"a": 0.1 + 0.2, "b": True, "c": None, "d": 2**63 - 1, "e": "x,y", "more": 3}
+    path = tmp_path / "t.parquet"
+    assert write_parquet(path, kinds, [row, {**row, "c": 4}])
+    first = path.read_bytes()
+    assert write_parquet(path, kinds, [row, {**row, "c": 4}])
+    assert path.read_bytes() == first
+    frame = polars.read_parquet(path)
+    assert frame.rows() == [(0.30000000000000004, True, c, 2**63 - 1, "x,y") for c in (None, 4)]
+    assert frame.dtypes == [polars.Float64, polars.Boolean, polars.Int64, polars.Int64, polars.String]
+    assert write_parquet(path, kinds, [])
+    assert polars.read_parquet(path).schema == frame.schema
+    with pytest.raises(CampaignError, match=r"t\.parquet: cannot be written"):
+        write_parquet(path, {"e": int}, [row])
+    assert list(contents(tmp_path)) == ["t.parquet"]
+
+
+def test_without_polars_there_is_no_parquet(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "polars", None)
+    assert not write_parquet(tmp_path / "t.parquet", {"a": int}, [{"a": 1}])
+    assert contents(tmp_path) == {}
 
 
 @given(st.floats(allow_nan=False, allow_infinity=False))

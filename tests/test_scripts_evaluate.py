@@ -1,6 +1,7 @@
 """``shepherd-phys evaluate`` from the outside: tables, JSON, continuing, shards, grids, and every mistake."""
 
 import csv
+import importlib.util
 import io
 import json
 import math
@@ -13,15 +14,15 @@ from pathlib import Path
 
 import pytest
 import tomli_w
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shepherd_phys import __version__, campaign
 from shepherd_phys.bodies import Disc
 from shepherd_phys.campaign import Ledger
 from shepherd_phys.controllers.evaluation import COLUMNS, METRICS, trial_seed
-from shepherd_phys.controllers.summary import summary_columns
-from shepherd_phys.scripts import evaluate, main
+from shepherd_phys.controllers.summary import difference_columns, summary_columns
+from shepherd_phys.scripts import evaluate, main, pictures
 from shepherd_phys.scripts.evaluate import GRID_KEYS, LISTS, read_options, read_shard
 from shepherd_phys.scripts.points import points
 from shepherd_phys.settings import SettingsError
@@ -56,6 +57,10 @@ class Chase:
 
 class Bad(Chase):
     def act(self, observation, state): return np.full((state.n_shepherds, 2), np.nan)
+
+class Faint(Chase):
+    def reset(self, rng):
+        if rng.random() < 0.5: raise RuntimeError("not today")
 
 class Half:
     lidar = None
@@ -107,6 +112,13 @@ class Free:
     def velocities(self, state, rng): return np.zeros((state.n_sheep, 2))
 class Needy(Disc):
     def __init__(self, what): pass
+class Late(Chase):
+    def __init__(self): 1 / 0
+class Heavy(Disc):
+    def __init__(self, **values): raise RuntimeError("too heavy")
+class Wild:
+    def __init__(self): raise RuntimeError("too wild")
+def maker(): raise KeyError("no")
 number = 3
 """
 
@@ -156,7 +168,11 @@ def test_the_command_in_a_shell(folder):
         "--trials 2 --workers 2"
     )
     assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines()[-3:] == ["results/episodes.csv", "results/summary.csv", "results/episode.png"]
+    names = ["episodes.csv", "episodes.parquet", "summary.csv", "differences.csv", "episode.png"]
+    if not importlib.util.find_spec("polars"):
+        names.remove("episodes.parquet")
+    assert done.stdout.splitlines()[-len(names) :] == [f"results/{name}" for name in names]
+    assert "difference from idle on the same seeds" in done.stdout
     assert "in at the end %" in done.stdout
     rows = read("results/episodes.csv")
     assert tuple(rows[0]) == COLUMNS
@@ -184,6 +200,7 @@ def test_json_is_all_that_there_is_on_standard_output(folder):
         assert (row["n_flocks"], row["cohesion"], row["n_shepherds"], row["trials"]) == (2, 40, 2, 2)
         for name in METRICS:
             assert row[f"{name}_low"] <= row[f"{name}_mean"] <= row[f"{name}_high"]
+    assert [row["differences"] is None for row in rows] == [False, True]  # mine:Chase is the first
     assert "o/summary.csv" in done.stderr
 
 
@@ -205,7 +222,7 @@ def test_tables_do_not_depend_on_workers_order_or_interruption(folder, in_proces
     with Ledger("b", __version__) as ledger:  # as a run that was killed half-way leaves it
         ledger._rows.execute("DELETE FROM episodes WHERE seed = ?", (trial_seed(20_000, 1),))
     assert run("--controllers", "idle", "random", "--out", "b", workers=1) == 0
-    for name in ("episodes.csv", "summary.csv"):
+    for name in ("episodes.csv", "summary.csv", "differences.csv"):
         assert Path("a", name).read_bytes() == Path("b", name).read_bytes()
 
 
@@ -213,7 +230,7 @@ def test_a_finished_campaign_runs_nothing(folder, in_process, monkeypatch, capsy
     assert run("--controllers", "idle") == 0
     first = {path.name: path.read_bytes() for path in Path("results").iterdir()}
     monkeypatch.setattr("shepherd_phys.campaign.attempt", None)
-    monkeypatch.setattr("shepherd_phys.scripts.evaluate.draw_episode", None)
+    monkeypatch.setattr("shepherd_phys.scripts.pictures.draw_episode", None)
     assert run("--controllers", "idle") == 0
     assert {path.name: path.read_bytes() for path in Path("results").iterdir()} == first
     assert mistakes(capsys.readouterr().err) == []
@@ -297,6 +314,84 @@ def test_shards_make_up_the_whole(folder, in_process):
     assert sorted(parts, key=key) == read("whole/episodes.csv")
 
 
+def test_shards_gathered_are_the_whole(folder, in_process, monkeypatch):
+    words = ["--controllers", "idle", "random", "--trials", "3"]
+    assert run(*words, "--out", "whole") == 0
+    for i in "12":
+        assert run(*words, "--out", i, "--shard", f"{i}/2") == 0
+    monkeypatch.setattr("shepherd_phys.campaign.attempt", None)
+    assert run(*words, "--gather", "1", "2", "--out", "all") == 0
+    tables = [path.name for path in Path("whole").iterdir() if not path.name.startswith("ledger")]
+    assert {"episodes.csv", "summary.csv", "differences.csv"} <= set(tables)
+    for name in tables:
+        assert Path("all", name).read_bytes() == Path("whole", name).read_bytes()
+
+
+def test_differences_are_paired_with_the_baseline(folder, in_process, capsys):
+    words = ["--controllers", "idle", "random", "mine:Chase", "--flocks", "1", "2", "--json"]
+    assert run(*words, "--baseline", "random") == 0
+    rows = json.loads(capsys.readouterr().out)
+    episodes = {(row["controller"], row["n_flocks"], row["seed"]): row for row in read("results/episodes.csv")}
+    for row in rows:
+        told = row["differences"]
+        if row["controller"] == "random":
+            assert told is None
+            continue
+        assert (told["baseline"], told["trials"]) == ("random", 2)
+        by_hand = [
+            float(own["path_length"]) - float(episodes["random", flocks, seed]["path_length"])
+            for (name, flocks, seed), own in episodes.items()
+            if (name, flocks) == (row["controller"], str(row["n_flocks"]))
+        ]
+        assert told["path_length_diff_mean"] == pytest.approx(sum(by_hand) / 2)
+        assert told["path_length_diff_low"] <= told["path_length_diff_mean"] <= told["path_length_diff_high"]
+    table = read("results/differences.csv")
+    assert tuple(table[0]) == difference_columns()
+    assert [(row["controller"], row["n_flocks"], row["baseline"]) for row in table] == [
+        (name, flocks, "random") for name in ("idle", "mine:Chase") for flocks in "12"
+    ]
+
+
+def test_the_baseline_is_the_first_controller_and_pairs_are_of_seeds_that_both_have(folder, in_process, capsys):
+    assert run("--controllers", "random", "mine:Faint", "--trials", "8", "--json") == 1
+    rows = {row["controller"]: row for row in json.loads(capsys.readouterr().out)}
+    assert 0 < rows["mine:Faint"]["trials"] < 8 == rows["random"]["trials"]
+    assert rows["random"]["differences"] is None
+    assert rows["mine:Faint"]["differences"]["baseline"] == "random"
+    assert rows["mine:Faint"]["differences"]["trials"] == rows["mine:Faint"]["trials"]
+
+
+def test_without_a_row_of_the_baseline_there_are_no_differences(folder, in_process, capsys):
+    assert run("--controllers", "mine:Bad", "idle", "--json") == 1
+    (row,) = json.loads(capsys.readouterr().out)
+    assert (row["controller"], row["differences"]) == ("idle", None)
+    assert Path("results/differences.csv").read_text() == ",".join(difference_columns()) + "\n"
+
+
+def test_tables_of_an_earlier_command_do_not_stay(folder, in_process, monkeypatch, capsys):
+    assert run("--controllers", "random", "idle") == 0
+    assert Path("results/differences.csv").exists()
+    monkeypatch.setitem(sys.modules, "polars", None)
+    capsys.readouterr()
+    assert run("--controllers", "idle") == 0
+    assert not Path("results/differences.csv").exists()
+    assert not Path("results/episodes.parquet").exists()
+    assert "difference" not in capsys.readouterr().out
+
+
+def test_parquet_is_the_same_table(folder, in_process):
+    polars = pytest.importorskip("polars")
+    assert run("--controllers", "idle", "random") == 0
+    frame = polars.read_parquet("results/episodes.parquet")
+    rows = read("results/episodes.csv")
+    assert tuple(frame.columns) == COLUMNS
+    assert [tuple(campaign._cell(cell) for cell in row) for row in frame.rows()] == [tuple(r.values()) for r in rows]
+    assert frame.schema["seed"] == polars.Int64 and frame.schema["success"] == polars.Boolean
+    first = Path("results/episodes.parquet").read_bytes()
+    assert run("--controllers", "idle", "random", "--out", "again") == 0
+    assert Path("again/episodes.parquet").read_bytes() == first
+
+
 def test_a_shard_may_be_empty(folder, in_process, capsys):
     assert run("--controllers", "idle", "--shard", "3/3", "--json") == 0
     assert json.loads(capsys.readouterr().out) == []
@@ -315,7 +410,7 @@ def test_failed_episodes_are_named_and_the_others_complete(folder, in_process, c
 
 
 def test_without_pygame_there_is_no_picture(folder, in_process, monkeypatch, capsys):
-    monkeypatch.setattr(evaluate.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(pictures.importlib.util, "find_spec", lambda name: None)
     assert run("--controllers", "idle") == 0
     said = capsys.readouterr()
     assert "pygame-ce is missing" in said.err
@@ -361,6 +456,7 @@ VALUES = {
 }
 
 
+@settings(deadline=None)
 @given(st.fixed_dictionaries({}, optional=VALUES))
 def test_points_are_the_full_cross_product_without_repeats(lists):
     found = points(**{"controllers": ["idle"], **lists})
@@ -399,6 +495,18 @@ MISTAKES = [
     ("--controllers mine:Nobody", "controllers: mine:Nobody: module 'mine' has no 'Nobody'"),
     ("--controllers nowhere:X", "module 'nowhere' cannot be imported: ModuleNotFoundError"),
     ("--controllers mine:number", "controller int: lacks lidar and reset and act"),
+    ("--controllers mine:Late", "controller Late: cannot be made: ZeroDivisionError: division by zero (mine.py:"),
+    ("--controllers mine:maker", "controllers: mine:maker: cannot be made: KeyError: 'no' (mine.py:"),
+    ("--body mine:Heavy", "body: mine:Heavy: cannot be made: RuntimeError: too heavy (mine.py:"),
+    ("--flock mine:Wild", "flock: mine:Wild: cannot be made: RuntimeError: too wild (mine.py:"),
+    ("--scenario heavy.toml --body mine:Heavy", "Scenario.shepherds[0]: mine:Heavy: RuntimeError: too heavy"),
+    ("--controllers leaves:X", "controllers: leaves:X: module 'leaves' cannot be imported: SystemExit: 3"),
+    ("--baseline random", "baseline: 'random' is not among the controllers (strombom)"),
+    ("--grid base.toml", "baseline: 'nobody' is not among the controllers (strombom)"),
+    ("--workers 1 --scheduler tcp://127.0.0.1:1", "--workers and --scheduler: the workers are the cluster's then"),
+    ("--gather", "--gather: needs at least one value"),
+    ("--gather nowhere", "nowhere: has no ledger to gather from"),
+    ("--gather other", "other/ledger.sqlite: holds rows of shepherd_phys 0.0.0, this is"),
     ("--flocks 0", "flocks: 0 is impossible; it must be at least 1"),
     ("--flocks abc", "['abc']; --flocks takes whole numbers"),
     ("--flocks", "--flocks: needs at least one value"),
@@ -459,6 +567,9 @@ def test_mistakes_are_one_clear_line(folder, capsys, words, message):
     Path("post.toml").write_text(tomli_w.dumps({**TINY, "obstacles": [{"kind": "mine:Post"}]}))
     Path("broken.toml").write_text(tomli_w.dumps({**TINY, "shepherds": [{"kind": "mine:Cart", "size": -1.0}]}))
     Path("full.toml").write_text(tomli_w.dumps({**TINY, "obstacles": [BOULDER]}))
+    Path("heavy.toml").write_text(tomli_w.dumps({**TINY, "shepherds": [{"kind": "mine:Heavy", "mass": 3.0}]}))
+    Path("leaves.py").write_text("raise SystemExit(3)")
+    Path("base.toml").write_text('baseline = "nobody"')
     Path("words.toml").write_text('flocks = ["two"]')
     Path("true.toml").write_text("trials = true")
     Path("none.toml").write_text("flocks = []")
@@ -530,7 +641,7 @@ def test_help_lists_every_flag(capsys):
         main.main(["evaluate", "--help"])
     assert end.value.code == 0
     said = capsys.readouterr().out
-    for flag in (*GRID_KEYS, "grid", "shard", "workers", "timeout", "out", "json"):
+    for flag in (*GRID_KEYS, "grid", "shard", "workers", "scheduler", "timeout", "out", "gather", "json"):
         assert f"--{flag}" in said
 
 
