@@ -5,12 +5,14 @@ from collections.abc import Callable
 from .base import Controller
 from .baselines import Idle, Random
 from .elfiqi import Elfiqi, ElfiqiLiteral
+from .learned import POLICIES, Policy, load_policy
 from .occlusion import Occlusion
 from .pierson import Pierson, PiersonReconstructed
 from .strombom import StrombomLiteral, StrombomTeam
 
 __all__ = [
     "CONTROLLERS",
+    "POLICIES",
     "Controller",
     "Elfiqi",
     "ElfiqiLiteral",
@@ -18,9 +20,11 @@ __all__ = [
     "Occlusion",
     "Pierson",
     "PiersonReconstructed",
+    "Policy",
     "Random",
     "StrombomLiteral",
     "StrombomTeam",
+    "load_policy",
 ]
 
 CONTROLLERS: dict[str, Callable[[], Controller]] = {
@@ -33,5 +37,6 @@ CONTROLLERS: dict[str, Callable[[], Controller]] = {
     "elfiqi": Elfiqi,
     "elfiqi-literal": ElfiqiLiteral,
     "occlusion": Occlusion,
+    **POLICIES,
 }
 """By name, for the command line; each call makes a fresh one."""

@@ -14,6 +14,7 @@ from shepherd_phys.state import WorldState
 from shepherd_phys.workers import explain
 
 from .base import Controller
+from .learned import Policy
 
 LABELS = ("controller", "n_flocks", "cohesion", "n_shepherds", "n_sheep", "scenario")
 """Columns that say what was run: together they name a point of an experiment."""
@@ -179,7 +180,9 @@ def parameters_of(controller: Any) -> dict[str, Any]:
 
 
 def name_of(controller: Any) -> str:
-    """Its class's name."""
+    """A policy's name; the class's name of any other."""
+    if isinstance(controller, Policy):
+        return controller.name
     return str((controller if inspect.isclass(controller) else type(controller)).__qualname__)
 
 

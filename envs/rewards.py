@@ -13,18 +13,20 @@ the whole team. N sheep, T steps of an episode, P shepherds.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from functools import cached_property
-from typing import Literal, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import numba
 import numpy as np
 from pydantic import Field
 
-from shepherd_phys.lidar import Scan
+from shepherd_phys.lidar import CHANNELS, Lidar, Scan
 from shepherd_phys.scenario import Scenario
-from shepherd_phys.settings import Settings, settings
+from shepherd_phys.settings import Settings, SettingsError, settings
 from shepherd_phys.state import Floats, WorldState
+from shepherd_phys.world import SHEEP_SETS, NonFiniteError
 
 
 class Term(Protocol):
@@ -111,6 +113,25 @@ class Occlusion(Settings):
         return float(shares.mean()) if len(shares) else 0.0
 
 
+@settings
+class Effort(Settings):
+    """Mean over the shepherds of speed over top speed, over T: what walking costs. In none of the paper's schemes.
+
+    The speed is what a shepherd walked in the control step over the step's length, so that the term adds up, over an
+    episode, to the path length over that of running all the time: 1 at most, but for what pushes a shepherd.
+    """
+
+    def shares(self, before: WorldState, after: WorldState, scan: Scan | None, scenario: Scenario) -> Floats:
+        """(P,) each shepherd's speed over its top speed, over T."""
+        walked = after.shepherd_path - before.shepherd_path
+        return np.asarray(walked / (after.shepherd_max_speed * (scenario.control_dt * scenario.n_steps)))
+
+    def __call__(self, before: WorldState, after: WorldState, scan: Scan | None, scenario: Scenario) -> float:
+        """Mean of the shares, 0 where there is no shepherd."""
+        shares = self.shares(before, after, scan, scenario)
+        return float(shares.mean()) if len(shares) else 0.0
+
+
 Scheme = Mapping[str, tuple[float, Term]]
 
 ORIGINAL: dict[str, tuple[float, Term]] = {"occupy": (10.0, Occupancy()), "distance": (-0.1, Distance())}
@@ -121,3 +142,95 @@ WILD: dict[str, tuple[float, Term]] = {**ORIGINAL, "occlude": (0.1, Occlusion(sh
 """The paper's "Wild Sheep"."""
 SCHEMES: dict[str, Scheme] = {"original": ORIGINAL, "any": ANY, "wild": WILD}
 """By name, for ``gymnasium.make`` and the command line."""
+
+
+def checked(rewards: Scheme | str) -> Scheme:
+    """A scheme from its name or from a mapping name -> (finite weight, callable term).
+
+    Raises:
+        SettingsError: it is neither.
+    """
+    if isinstance(rewards, str):
+        if rewards not in SCHEMES:
+            raise SettingsError(f"rewards: {rewards!r} is not one of {', '.join(SCHEMES)}")
+        return SCHEMES[rewards]
+    try:
+        scheme = {str(name): (float(weight), term) for name, (weight, term) in rewards.items()}
+    except (AttributeError, TypeError, ValueError):
+        raise SettingsError(
+            f"rewards: needs a scheme's name or a mapping name -> (weight, term) (given: {rewards!r})"
+        ) from None
+    for name, (weight, term) in scheme.items():
+        if not callable(term) or not np.isfinite(weight):
+            raise SettingsError(
+                f"rewards[{name!r}]: needs a finite weight and a callable term (given: {weight}, {term!r})"
+            )
+    return scheme
+
+
+def scans_for(scheme: Scheme, lidar: Lidar | None) -> tuple[Lidar | None, tuple[str, ...]]:
+    """What `World.scan` is to be asked for so that one scan serves observation and rewards.
+
+    Args:
+        scheme: the reward's terms.
+        lidar: what is observed, if anything is.
+
+    Returns:
+        the lidar with every channel that either of them reads, None where nothing asks for a scan; and the sets of
+        sheep to scan on their own.
+
+    Raises:
+        SettingsError: a term asks for a scan that there is not.
+    """
+    wanted = [name for _, term in scheme.values() for name in getattr(term, "scans", ())]
+    unknown = [name for name in wanted if name not in (*CHANNELS, *SHEEP_SETS)]
+    if unknown:
+        raise SettingsError(f"rewards: there is no scan {unknown[0]!r}; there are {(*CHANNELS, *SHEEP_SETS)}")
+    sets = tuple(name for name in SHEEP_SETS if name in wanted)
+    seen = lidar.channels if lidar is not None else ()
+    channels = tuple(name for name in CHANNELS if name in wanted or name in seen)
+    if sets and not channels:
+        channels = CHANNELS[:1]  # a lidar has at least one channel
+    return ((lidar or Lidar()).but(channels=channels) if channels else None), sets
+
+
+class Earned(NamedTuple):
+    """What one term of a scheme gave in a control step."""
+
+    name: str
+    weight: float
+    value: float
+    """Weighted, for the whole team."""
+    shares: list[float] | None
+    """Each shepherd's own, not weighted; None for a term without shares."""
+
+
+def earned(
+    scheme: Scheme, before: WorldState, after: WorldState, scan: Scan | None, scenario: Scenario
+) -> list[Earned]:
+    """Ask every term of a scheme; the reward of the step is the sum of the values, in this order.
+
+    Raises:
+        ValueError: a term gave something that is no number, or, as `NonFiniteError`, not a finite one.
+    """
+    terms = []
+    for name, (weight, term) in scheme.items():
+        own: list[float] | None = None
+        if hasattr(term, "shares"):
+            shares = np.asarray(term.shares(before, after, scan, scenario))
+            if shares.shape != (after.n_shepherds,):
+                raise ValueError(
+                    f"rewards[{name!r}].shares: needs shape ({after.n_shepherds},) (given: {shares.shape})"
+                )
+            own = shares.tolist()
+            value = sum(own) / max(len(own), 1)
+        else:
+            value = term(before, after, scan, scenario)
+        try:
+            weighted = weight * float(value)
+        except (TypeError, ValueError):
+            raise ValueError(f"rewards[{name!r}]: the term must give a number (given: {value!r})") from None
+        if not math.isfinite(weighted):
+            raise NonFiniteError(f"rewards[{name!r}]: the term gave {value}, which is not finite")
+        terms.append(Earned(name, weight, weighted, own))
+    return terms

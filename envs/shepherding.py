@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from pathlib import Path
 from typing import Any, Literal, SupportsFloat
@@ -13,15 +12,13 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from shepherd_phys.lidar import CHANNELS, Lidar, Scan, Stack, encode
-from shepherd_phys.scenario import SUCCESS_FRACTION, Scenario, load_scenario
+from shepherd_phys.scenario import Scenario, load_scenario
 from shepherd_phys.settings import SettingsError
 from shepherd_phys.state import Floats, WorldState
-from shepherd_phys.world import SHEEP_SETS, NonFiniteError, World
+from shepherd_phys.world import World
 
-from .rewards import SCHEMES, Scheme
-
-SUCCESS_SECONDS = 5.0
-"""With ``terminate_on_success`` it ends when that held for so long [s]."""
+from .outcome import HeldSuccess, measures
+from .rewards import Scheme, checked, earned, scans_for
 
 
 class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
@@ -120,7 +117,7 @@ class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.scenario = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
         self.render_mode = render_mode
         self.render_size = render_size
-        self._scheme = _scheme(rewards)
+        self._scheme = checked(rewards)
         if lidar == "default":
             lidar = Lidar(channels=CHANNELS if self.scenario.obstacles else CHANNELS[:3])
         if lidar is not None and not isinstance(lidar, Lidar):
@@ -128,18 +125,7 @@ class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.lidar = lidar
         self.world = World(self.scenario)
 
-        # one scan serves observation and rewards: it has every channel that either of them reads
-        wanted = [name for _, term in self._scheme.values() for name in getattr(term, "scans", ())]
-        unknown = [name for name in wanted if name not in (*CHANNELS, *SHEEP_SETS)]
-        if unknown:
-            raise SettingsError(f"rewards: there is no scan {unknown[0]!r}; there are {(*CHANNELS, *SHEEP_SETS)}")
-        self._sets = tuple(name for name in SHEEP_SETS if name in wanted)
-        seen = lidar.channels if lidar is not None else ()
-        channels = tuple(name for name in CHANNELS if name in wanted or name in seen)
-        if self._sets and not channels:
-            channels = CHANNELS[:1]  # a lidar has at least one channel
-        self._scan_lidar = (lidar or Lidar()).but(channels=channels) if channels else None
-
+        self._scan_lidar, self._sets = scans_for(self._scheme, lidar)
         n_shepherds = self.scenario.n_shepherds
         shape = lidar.observation_shape(n_shepherds) if lidar is not None else (n_shepherds, 0)
         self.observation_space = spaces.Box(0.0, 1.0, shape, np.float32)
@@ -152,7 +138,7 @@ class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             for name, (_, term) in self._scheme.items()
             if hasattr(term, "shares")
         }
-        self._success_since: float | None = None
+        self._held = HeldSuccess()
         self._trails: deque[Floats] = deque(maxlen=trail_steps)
         self._start: Floats | None = None
         self._scan: Scan | None = None
@@ -180,7 +166,7 @@ class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         if options:
             raise SettingsError(f"options: none are known (given: {sorted(options)})")
         state = self.world.reset(int(self.np_random.integers(2**63)) if seed is None else seed)
-        self._success_since = None
+        self._held.reset()
         self.beam_offset = np.zeros(self.scenario.n_shepherds, dtype=np.int64)
         self._trails.clear()
         self._start = state.sheep_pos
@@ -190,7 +176,7 @@ class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         zeros = {f"reward/{name}": 0.0 for name in self._scheme}
         for keys in self._share_keys.values():
             zeros.update(dict.fromkeys(keys, 0.0))
-        info = {**self._measures(state), **zeros}
+        info = {**measures(state), **zeros}
         self._held(state, info["is_success"])
         return self._observe(), info
 
@@ -208,41 +194,17 @@ class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         if self.render_mode is not None:
             self._trails.append(after.shepherd_pos)
         self._scan = self._look()
-        info = self._measures(after)
+        info = measures(after)
         reward = 0.0
-        for name, (weight, term) in self._scheme.items():
-            if name in self._share_keys:
-                shares = np.asarray(term.shares(before, after, self._scan, self.scenario))  # type: ignore[attr-defined]
-                if shares.shape != (after.n_shepherds,):
-                    raise ValueError(
-                        f"rewards[{name!r}].shares: needs shape ({after.n_shepherds},) (given: {shares.shape})"
-                    )
-                own = shares.tolist()
-                value = sum(own) / max(len(own), 1)
-                info.update(zip(self._share_keys[name], own, strict=True))
-            else:
-                value = term(before, after, self._scan, self.scenario)
-            try:
-                weighted = weight * float(value)
-            except (TypeError, ValueError):
-                raise ValueError(f"rewards[{name!r}]: the term must give a number (given: {value!r})") from None
-            if not math.isfinite(weighted):
-                raise NonFiniteError(f"rewards[{name!r}]: the term gave {value}, which is not finite")
-            info[f"reward/{name}"] = weighted
-            reward += weighted
+        for term in earned(self._scheme, before, after, self._scan, self.scenario):
+            info[f"reward/{term.name}"] = term.value
+            reward += term.value
+            if term.shares is not None:
+                info.update(zip(self._share_keys[term.name], term.shares, strict=True))
         held = self._held(after, info["is_success"])
         terminated = self.scenario.terminate_on_success and held
         truncated = after.step >= self.scenario.n_steps
         return self._observe(), reward, terminated, truncated, info
-
-    def _held(self, state: WorldState, success: bool) -> bool:
-        """Whether the episode has been a success for long enough."""
-        if not success:
-            self._success_since = None
-            return False
-        if self._success_since is None:
-            self._success_since = state.time
-        return state.time - self._success_since >= SUCCESS_SECONDS - 1e-9
 
     def render(self) -> NDArray[np.uint8] | None:
         """A picture (height, width, 3) of the state, or None without a render mode."""
@@ -267,34 +229,3 @@ class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._stack.push(encode(self._scan, self.lidar))
         observation, self.beam_offset = self._stack.observe(self.beam_offset)
         return observation
-
-    def _measures(self, state: WorldState) -> dict[str, Any]:
-        n = state.n_sheep
-        in_goal = int(np.count_nonzero(state.sheep_in_goal)) / n
-        return {
-            "in_goal": in_goal,
-            "ever_in_goal": int(np.count_nonzero(state.sheep_arrived)) / n,
-            "path_length": sum(state.shepherd_path.tolist()) / max(state.n_shepherds, 1),
-            "collisions": state.collisions,
-            "is_success": in_goal >= SUCCESS_FRACTION,
-        }
-
-
-def _scheme(rewards: Scheme | str) -> Scheme:
-    """A scheme, checked: a mapping name -> (finite weight, callable term)."""
-    if isinstance(rewards, str):
-        if rewards not in SCHEMES:
-            raise SettingsError(f"rewards: {rewards!r} is not one of {', '.join(SCHEMES)}")
-        return SCHEMES[rewards]
-    try:
-        scheme = {str(name): (float(weight), term) for name, (weight, term) in rewards.items()}
-    except (AttributeError, TypeError, ValueError):
-        raise SettingsError(
-            f"rewards: needs a scheme's name or a mapping name -> (weight, term) (given: {rewards!r})"
-        ) from None
-    for name, (weight, term) in scheme.items():
-        if not callable(term) or not np.isfinite(weight):
-            raise SettingsError(
-                f"rewards[{name!r}]: needs a finite weight and a callable term (given: {weight}, {term!r})"
-            )
-    return scheme

@@ -21,7 +21,7 @@ from typing import Any
 from shepherd_phys import __version__
 from shepherd_phys.bodies import BODIES, Body, Disc
 from shepherd_phys.campaign import Outcome, Task, settings_hash, write_csv, write_parquet
-from shepherd_phys.controllers import CONTROLLERS, Controller
+from shepherd_phys.controllers import CONTROLLERS, Controller, Policy, load_policy
 from shepherd_phys.controllers.evaluation import (
     COLUMNS,
     LABELS,
@@ -51,7 +51,7 @@ class Point:
     """A controller in a scenario, by name, so that it can be sent to a worker."""
 
     controller: str
-    """A name of `CONTROLLERS`, or ``module:Name``."""
+    """A name of `CONTROLLERS`, a policy's .json file, or ``module:Name``."""
     scenario_name: str
     scenario: Scenario
 
@@ -82,7 +82,8 @@ class Point:
         try:
             return settings_hash(
                 {
-                    "controller": self.controller,
+                    # a policy is its checksum, wherever its file lies
+                    "controller": controller.checksum if isinstance(controller, Policy) else self.controller,
                     "parameters": parameters_of(controller),
                     "scenario": scenario.to_dict(),
                     "sources": {kind_of(thing): source_hash(thing) for thing in things if ":" in kind_of(thing)},
@@ -109,7 +110,7 @@ def points(
     """Every combination; what is left out is the scenario's.
 
     Args:
-        controllers: names, or ``module:Name`` of a user's own.
+        controllers: names, policy files, or ``module:Name`` of a user's own.
         scenario: a preset's name or a TOML file.
         flocks: numbers of flocks.
         cohesion: n, neighbours in the flock model's cohesion.
@@ -235,12 +236,14 @@ def write_tables(
 
 
 def find_controller(name: str) -> Controller:
-    """A fresh controller by its name or ``module:Name``.
+    """A fresh controller by its name, from a policy file NAME.json, or ``module:Name``.
 
     Raises:
         SettingsError: there is none of this name.
         ControllerError: the object is no controller.
     """
+    if name.endswith(".json"):
+        return load_policy(name)
     if ":" in name:
         own = imported(name, "controllers")
         if inspect.isroutine(own):  # a function that makes one
@@ -253,7 +256,8 @@ def find_controller(name: str) -> Controller:
         return checked_controller(own)
     if name not in CONTROLLERS:
         raise SettingsError(
-            f"controllers: {name!r} is unknown; there are {', '.join(sorted(CONTROLLERS))}, or module:Name of your own"
+            f"controllers: {name!r} is unknown; there are {', '.join(sorted(CONTROLLERS))}, a policy's .json file, "
+            "or module:Name of your own"
         )
     return CONTROLLERS[name]()
 

@@ -320,6 +320,10 @@ class Stack:
         n_shepherds, n_channels, beams = chosen[0].shape
         return np.concatenate(chosen, axis=1).reshape(n_shepherds, len(chosen), n_channels, beams)
 
+    def offset(self, last: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The beam offsets (P,) that `observe` would answer, in the goal frame, without an observation."""
+        return _goal_offsets(self._frames[-1], last, self._lidar)
+
     def observe(self, offset: NDArray[np.int64]) -> tuple[Proximities, NDArray[np.int64]]:
         """`observe` of the frames, without its copy."""
         lidar = self._lidar
@@ -344,7 +348,9 @@ def observe(stack: Proximities, offset: NDArray[np.int64], lidar: Lidar) -> tupl
         lit, or more than half of them (then the shepherd stands inside; obstacles so near to the goal that they cut
         half of the way out hide that from it).
     """
-    return _observe(np.array(stack, np.float32), np.asarray(offset, np.int64), lidar)
+    rolled = lidar.frame == "goal" or (lidar.sectors or lidar.beams) != lidar.beams  # then it is fresh anyway
+    frames = np.ascontiguousarray(stack, np.float32) if rolled else np.array(stack, np.float32)
+    return _observe(frames, np.asarray(offset, np.int64), lidar)
 
 
 def _observe(stack: Proximities, offset: NDArray[np.int64], lidar: Lidar) -> tuple[Proximities, NDArray[np.int64]]:
@@ -356,10 +362,8 @@ def _observe(stack: Proximities, offset: NDArray[np.int64], lidar: Lidar) -> tup
         rows = stack.reshape(-1, n_frames * n_channels, beams)
         offset = np.ascontiguousarray(offset)
         if lidar.frame == "goal":
-            newest = rows[:, (n_frames - 1) * n_channels + lidar.channels.index("goal")]
-            offset = _frames.goal_offsets(
-                np.ascontiguousarray(newest), offset.reshape(-1), beam_directions(beams)
-            ).reshape(offset.shape)
+            newest = rows[:, (n_frames - 1) * n_channels :]
+            offset = _goal_offsets(newest, offset.reshape(-1), lidar).reshape(offset.shape)
             turns = offset.reshape(-1)
         else:
             turns = np.zeros(len(rows), np.int64)
@@ -368,6 +372,13 @@ def _observe(stack: Proximities, offset: NDArray[np.int64], lidar: Lidar) -> tup
         framed = rows.reshape(*teams, n_frames, n_channels * columns)
         return np.ascontiguousarray(np.moveaxis(framed, -2, -1))[..., None, :], offset
     return rows.reshape(*teams, n_frames * n_channels, columns), offset
+
+
+def _goal_offsets(frame: Proximities, last: NDArray[np.int64], lidar: Lidar) -> NDArray[np.int64]:
+    """The beam offsets (P,) after a frame (P, channels, beams)."""
+    goal = np.ascontiguousarray(frame[:, lidar.channels.index("goal")])
+    offsets: NDArray[np.int64] = _frames.goal_offsets(goal, last, beam_directions(lidar.beams))
+    return offsets
 
 
 def turn(action: NDArray[Any], offset: NDArray[np.int64], beams: int) -> NDArray[Any]:

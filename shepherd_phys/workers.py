@@ -196,7 +196,7 @@ class _Worker:
         self.pipe, theirs = context.Pipe()
         self.process = context.Process(target=_serve, args=(theirs, work), name="shepherd-phys worker", daemon=True)
         try:
-            with _birth():
+            with birth():
                 self.process.start()
         except OSError as error:
             raise WorkersError(f"workers cannot start: {error}") from error
@@ -252,7 +252,7 @@ class _Worker:
 
 
 @contextmanager
-def _birth() -> Iterator[None]:
+def birth() -> Iterator[None]:
     """While a worker is born: the environment that it inherits, and no Ctrl-C for it."""
     before = {name: os.environ.get(name) for name in SINGLE_THREADED}
     os.environ.update(SINGLE_THREADED)
@@ -272,7 +272,7 @@ def _birth() -> Iterator[None]:
 def _serve(pipe: connection.Connection, pickled_work: bytes) -> None:
     """A worker's life: import the work, then do jobs until the pipe ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_owner, daemon=True).start()
+    threading.Thread(target=end_with_owner, daemon=True).start()
     os.dup2(2, 1)  # standard output belongs to the owner, who may be writing JSON there
     try:
         work = pickle.loads(pickled_work)
@@ -288,7 +288,8 @@ def _serve(pipe: connection.Connection, pickled_work: bytes) -> None:
         pipe.send(attempt(work, job))
 
 
-def _end_with_owner() -> None:
+def end_with_owner() -> None:
+    """Wait in a worker until its owner has died, then end it."""
     owner = multiprocessing.parent_process()
     if owner is not None:
         owner.join()

@@ -7,6 +7,7 @@ one compiled call for the flock, one for the servo, one for the measures of the 
 from __future__ import annotations
 
 import math
+import weakref
 from collections import Counter
 from collections.abc import Mapping
 from typing import Any
@@ -54,6 +55,15 @@ HASH_CELL = 4.7
 
 _LINEAR = batch.BodyFields.POSITION | batch.BodyFields.VELOCITY
 _POSES = _LINEAR | batch.BodyFields.ANGLE | batch.BodyFields.ANGULAR_VELOCITY
+
+
+_SPARE_BUFFERS: list[tuple[batch.Buffer, batch.Buffer]] = []
+"""pymunk never frees a batch buffer: a world uses its two for every Space, and leaves them here for another world."""
+
+
+def _buffers() -> tuple[batch.Buffer, batch.Buffer]:
+    """A buffer to read and one to write, which nobody else uses."""
+    return _SPARE_BUFFERS.pop() if _SPARE_BUFFERS else (batch.Buffer(), batch.Buffer())
 
 
 class NonFiniteError(FloatingPointError, ValueError):
@@ -322,9 +332,9 @@ class World:
         self._poses = np.zeros((n + p, 3))
         self._force = np.zeros((n_rows, 3 if self._spins else 2))
         if "_read_buffer" not in self.__dict__:
-            # pymunk never frees batch buffers: made once and used by every Space of this world; not before the first
-            # reset, so that a fresh world can be pickled
-            self._read_buffer, self._write_buffer = batch.Buffer(), batch.Buffer()
+            # not before the first reset, so that a fresh world can be pickled
+            self._read_buffer, self._write_buffer = buffers = _buffers()
+            weakref.finalize(self, _SPARE_BUFFERS.append, buffers)
         self._write_buffer.set_float_buf(self._force)
         self._fields = _POSES if self._spins else _LINEAR
         self._force_fields = batch.BodyFields.FORCE | batch.BodyFields.TORQUE if self._spins else batch.BodyFields.FORCE

@@ -16,7 +16,12 @@ def arranged(sheep, shepherds, goal=(0.0, 0.0)):
     template = World(Scenario(n_sheep=len(sheep), n_flocks=1, shepherds=len(shepherds))).reset(0)
     away = np.linalg.norm(sheep - goal, axis=1)
     return template.but(
-        sheep_pos=sheep, shepherd_pos=shepherds, goal_pos=goal, sheep_in_goal=away <= 2.5, sheep_arrived=away <= 2.5
+        sheep_pos=sheep,
+        shepherd_pos=shepherds,
+        goal_pos=goal,
+        sheep_goal_distance=np.maximum(away - 2.5, 0.0),
+        sheep_in_goal=away <= 2.5,
+        sheep_arrived=away <= 2.5,
     )
 
 

@@ -8,11 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shepherd_phys.envs import ANY, ORIGINAL, SCHEMES, WILD, ShepherdingEnv
-from shepherd_phys.envs.rewards import Distance, Occlusion, Occupancy
+from shepherd_phys.envs.rewards import Distance, Effort, Occlusion, Occupancy
 from shepherd_phys.flock import Strombom
 from shepherd_phys.lidar import Lidar
 from shepherd_phys.scenario import Scenario
 from shepherd_phys.settings import SettingsError
+from shepherd_phys.state import WorldState
 from shepherd_phys.world import World
 
 FOUR = Scenario(n_sheep=4, n_flocks=1, shepherds=2, goal_pos=(0.0, 0.0), n_steps=10, flock=Strombom())
@@ -38,6 +39,24 @@ def test_distance_by_hand(norm, divisor):
     _, state = arranged(FOUR, [[0, 0], [3.5, 0], [0, -4.5], [3, 4]], [[20, 0], [-20, 0]])
     # outside by 1, 2 and 2.5 m
     assert Distance(norm=norm)(state, state, None, FOUR) == pytest.approx((3 + 5.5) / divisor, rel=1e-15)
+
+
+def test_effort_is_the_path_over_that_of_running_all_the_time():
+    scenario = FOUR.but(n_steps=8)
+    effort = Effort()
+    env = ShepherdingEnv(scenario, rewards={"effort": (-2.0, effort)}, lidar=None)
+    env.reset(seed=0)
+    paid, own, done = 0.0, np.zeros(2), False
+    while not done:  # one runs, the other strolls
+        _, reward, _, done, info = env.step([[1.0, 0.0], [0.0, 0.25]])
+        paid += reward
+        own += [info["share/effort/0"], info["share/effort/1"]]
+    furthest = 8 * 0.2 * 1.5
+    assert own == pytest.approx(env.state.shepherd_path / furthest, rel=1e-12)
+    assert paid == pytest.approx(-2.0 * info["path_length"] / furthest, rel=1e-12)
+    assert 0.2 < own[1] < 0.3 < 0.9 < own[0] <= 1.0
+    nobody = WorldState.of({**vars(env.state), "shepherd_path": np.zeros(0), "shepherd_max_speed": np.zeros(0)})
+    assert effort(nobody, nobody, None, scenario) == 0.0
 
 
 def line_up(distance_to_sheep, goal_distance=8.0, **term):

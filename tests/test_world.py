@@ -1,6 +1,7 @@
 """The world: servo, contacts, determinism, guards, counting; the contract of pymunk's batch API."""
 
 import dataclasses
+import gc
 import hashlib
 import math
 import multiprocessing
@@ -609,3 +610,25 @@ def test_driven_sheep_do_not_run_through_one_another_and_resting_ones_do_not_ove
         calm = world.step(np.zeros((3, 2)))
     gaps = np.linalg.norm(calm.sheep_pos[:, None] - calm.sheep_pos[None], axis=2) + apart
     assert gaps.min() > 0.3 - 2 * world.scenario.collision_slop
+
+
+def test_worlds_that_are_gone_leave_their_buffers_to_new_ones(monkeypatch):
+    """pymunk never frees them, and training makes a world for each episode."""
+    made = []
+    buffer = batch.Buffer
+    monkeypatch.setattr(batch, "Buffer", lambda: made.append(buffer()) or made[-1])
+    scenarios = [Scenario(n_sheep=n, n_flocks=1, shepherds=1) for n in (3, 40, 5, 7)]
+    rows = []
+    for scenario in (*scenarios, *scenarios):
+        world = World(scenario)
+        world.reset(1)
+        rows.append(world.step([[1.0, 0.0]]).sheep_pos.tobytes())
+        del world
+        gc.collect()
+    assert len(made) <= 2
+    assert rows[:4] == rows[4:]
+    first, second = World(scenarios[0]), World(scenarios[1])  # two at a time share nothing
+    for world in (first, second):
+        world.reset(1)
+    second.step([[1.0, 0.0]])
+    assert first.step([[1.0, 0.0]]).sheep_pos.tobytes() == rows[0]

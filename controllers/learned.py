@@ -1,0 +1,125 @@
+"""`Policy`: a controller that was learned, deployed on numpy alone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from shepherd_phys.lidar import Lidar, beam_directions, observe
+from shepherd_phys.state import WorldState
+
+from .network import Actor
+from .policy_files import PolicySpec, read_policy
+
+SHIPPED = Path(__file__).parent / "policies"
+
+
+class Policy:
+    """Moves every shepherd by the same network, each by its own observation alone.
+
+    Deterministic: the action is the mean of the distribution that it had while learning, clipped to the unit disc.
+
+    Args:
+        spec: what it was trained with.
+        weights: of its network, float32 by name.
+        checksum: identifies it in results.
+        name: for results and messages.
+    """
+
+    def __init__(
+        self, spec: PolicySpec, weights: Mapping[str, NDArray[np.float32]], checksum: str = "", name: str = "policy"
+    ) -> None:
+        self.spec = spec
+        self.weights = dict(weights)
+        self.checksum = checksum
+        self.name = name
+        self._actor = Actor(spec.network, spec.lidar, weights)
+        self._frames = (spec.lidar.stack, len(spec.lidar.channels), spec.lidar.beams)
+        # in the goal frame each shepherd's roll depends on its last one, which is the controller's to remember: the env
+        # gives all beams in the world frame
+        self._rolls = spec.lidar.frame == "goal"
+        self._lidar = spec.lidar.but(frame="world", sectors=None) if self._rolls else spec.lidar
+        self._directions = beam_directions(spec.lidar.beams)
+        self._offset: NDArray[np.int64] | None = None
+        self._action: NDArray[np.float64] | None = None
+
+    @classmethod
+    def load(cls, path: str | Path, classes: Iterable[Any] = ()) -> Self:
+        """Read a policy file; see `load_policy`."""
+        spec, weights, checksum = read_policy(path, classes)
+        return cls(spec, weights, checksum, Path(path).stem)
+
+    @property
+    def lidar(self) -> Lidar:
+        """What the env must deliver."""
+        return self._lidar
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Forget the last episode."""
+        self._offset = self._action = None
+
+    def act(self, observation: NDArray[np.float32], state: WorldState) -> NDArray[np.float64]:
+        """(P, 2).
+
+        Args:
+            observation: (P, stack x channels, beams or sectors) by the settings ``lidar``.
+            state: only its clock is read.
+        """
+        n = len(observation)
+        if n == 0:
+            return np.zeros((0, 2))
+        if self._offset is None:
+            self._offset = np.zeros(n, np.int64)
+        if self._rolls:
+            observation, self._offset = observe(observation.reshape(n, *self._frames), self._offset, self.spec.lidar)
+        if self._action is not None and state.step % self.spec.action.interval:
+            return self._action.copy()
+        self._action = _wanted(self._actor(observation), self._offset, self._directions)
+        return self._action.copy()
+
+    def to_dict(self) -> dict[str, Any]:
+        """What identifies it in results."""
+        return {"policy": self.checksum}
+
+
+@njit(cache=True, error_model="numpy")
+def _wanted(actions, offset, directions):  # type: ignore[no-untyped-def]
+    """Actions (P, 2) of a network as the world takes them.
+
+    Clipped to [-1, 1], as while learning, and to the unit disc, as the world does; turned by the angle of beam
+    ``offset`` (P,), as `shepherd_phys.lidar.turn` does.
+    """
+    wanted = np.empty(actions.shape)
+    for p in range(len(actions)):
+        x = min(max(np.float64(actions[p, 0]), -1.0), 1.0)
+        y = min(max(np.float64(actions[p, 1]), -1.0), 1.0)
+        length = max(math.hypot(x, y), 1.0)
+        cos, sin = directions[0, offset[p]] / length, directions[1, offset[p]] / length
+        wanted[p, 0] = cos * x - sin * y
+        wanted[p, 1] = sin * x + cos * y
+    return wanted
+
+
+def load_policy(path: str | Path, classes: Iterable[Any] = ()) -> Policy:
+    """A controller from a policy file NAME.json, with NAME.safetensors beside it.
+
+    Args:
+        path: of the JSON file.
+        classes: a user's own classes (of bodies, flock models, obstacles) that its scenario names, for those who want
+            to make that scenario's world; acting does not need them.
+
+    Raises:
+        PolicyError: the file is missing, damaged or not a policy.
+    """
+    return Policy.load(path, classes)
+
+
+POLICIES = {path.stem: partial(load_policy, path) for path in sorted(SHIPPED.glob("*.json"))}
+"""The policies that ship with the package by name; each call reads one."""

@@ -1,0 +1,183 @@
+"""The actor's network without torch: from one shepherd's observation to its action."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from pydantic import Field
+
+from shepherd_phys.lidar import Lidar
+from shepherd_phys.settings import Settings, SettingsError, settings
+
+Weights = Mapping[str, NDArray[np.float32]]
+
+Size = Field(ge=1, le=4096)
+
+
+@settings
+class SectorNetwork(Settings):
+    """Groups of neighbouring columns share one layer; then two layers over all groups, and the action.
+
+    With R = stack x channels rows and C columns (sectors, or beams) in an observation, G = C / ``group`` groups::
+
+        group g:  relu(W_1 x_g + b_1),  x_g the (R, overlap + group + overlap) numbers of the group and its neighbours
+        hidden:   relu(W_2 [all groups] + b_2)
+        latent:   tanh(W_3 . + b_3)
+        action:   W_4 . + b_4, the mean of the action's distribution while learning
+
+    All groups use the same W_1, as a convolution does, and beams wrap around: the neighbours of the first group are the
+    last one's columns. There is no normalisation of any input.
+    """
+
+    group: int = Field(default=4, ge=1, le=4096)
+    """Columns in a group."""
+    overlap: int = Field(default=0, ge=0, le=64)
+    """Columns on either side of a group that its layer sees besides."""
+    features: int = Field(default=32, ge=1, le=4096)
+    """Numbers that the shared layer makes of a group."""
+    hidden: int = Field(default=192, ge=1, le=4096)
+    """Width of the layer over all groups."""
+    latent: int = Field(default=64, ge=1, le=4096)
+    """Width of the last layer before the action."""
+
+    def shapes(self, lidar: Lidar) -> dict[str, tuple[int, ...]]:
+        """Shape of each weight by name, for observations of these lidar settings.
+
+        Raises:
+            SettingsError: the network does not fit the observation.
+        """
+        rows, columns = input_shape(lidar)
+        if columns % self.group:
+            raise SettingsError(
+                f"SectorNetwork.group: must divide the {columns} columns of an observation (given: {self.group})"
+            )
+        if self.overlap * 2 + self.group > columns:
+            raise SettingsError(
+                f"SectorNetwork.overlap: a group of {self.group} with its neighbours must fit in {columns} columns "
+                f"(given: {self.overlap})"
+            )
+        seen = rows * (self.group + 2 * self.overlap)
+        groups = columns // self.group
+        return {
+            "groups.weight": (self.features, seen),
+            "groups.bias": (self.features,),
+            "hidden.weight": (self.hidden, groups * self.features),
+            "hidden.bias": (self.hidden,),
+            "latent.weight": (self.latent, self.hidden),
+            "latent.bias": (self.latent,),
+            "action.weight": (2, self.latent),
+            "action.bias": (2,),
+            "log_std": (2,),
+        }
+
+
+ARCHITECTURES: dict[str, type[SectorNetwork]] = {"SectorNetwork": SectorNetwork}
+"""By name, for policy files."""
+
+
+def input_shape(lidar: Lidar) -> tuple[int, int]:
+    """(R, C): rows and columns of one shepherd's observation, as a network takes it.
+
+    Raises:
+        SettingsError: the observation is laid out otherwise.
+    """
+    if lidar.layout != "rows":
+        raise SettingsError(f"Lidar.layout: a policy's network takes 'rows' (given: {lidar.layout!r})")
+    _, rows, columns = lidar.observation_shape(1)
+    return rows, columns
+
+
+class Actor:
+    """The network with its weights, ready to run.
+
+    Args:
+        network: its sizes.
+        lidar: of the observations.
+        weights: arrays of the names and shapes that ``network.shapes(lidar)`` tells; ``log_std`` is not used.
+    """
+
+    def __init__(self, network: SectorNetwork, lidar: Lidar, weights: Weights) -> None:
+        self._shape = input_shape(lidar)
+        self._group, self._overlap = network.group, network.overlap
+        # a layer's weights input by input: what an input of 0 would read is not read at all
+        self._layers = [
+            array
+            for name in ("groups", "hidden", "latent", "action")
+            for array in (np.array(weights[f"{name}.weight"].T, order="C"), np.array(weights[f"{name}.bias"]))
+        ]
+
+    def __call__(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(P, 2) actions, not clipped, of P observations (P, R, C) float32."""
+        if observation.shape[1:] != self._shape:
+            raise ValueError(
+                f"observation: needs the shape (P, {self._shape[0]}, {self._shape[1]}), has {observation.shape}"
+            )
+        actions: NDArray[np.float32] = _forward(
+            np.ascontiguousarray(observation, np.float32), self._group, self._overlap, *self._layers
+        )
+        return actions
+
+
+@njit(cache=True, error_model="numpy")
+def _forward(observation, group, overlap, w1, b1, w2, b2, w3, b3, w4, b4):  # type: ignore[no-untyped-def]
+    """As `SectorNetwork` says, weights input by input: (inputs, outputs).
+
+    Most of what a lidar observes is 0, and so is half of what a relu gives: both are skipped.
+    """
+    n, rows, columns = observation.shape
+    groups, features = columns // group, len(b1)
+    width = group + 2 * overlap
+    reach = (overlap + group - 1) // group
+    shared = np.empty((n, groups, features), np.float32)
+    shared[:] = b1
+    for p in range(n):
+        for r in range(rows):
+            for c in range(columns):
+                x = observation[p, r, c]
+                if x != 0.0:
+                    for near in range(c // group - reach, c // group + reach + 1):
+                        k = c - near * group + overlap
+                        if 0 <= k < width:
+                            _add(shared[p, near % groups], x, w1[r * width + k])
+    inputs = shared.reshape(n, groups * features)
+    hidden = np.empty((n, len(b2)), np.float32)
+    hidden[:] = b2
+    _add_layer(hidden, inputs, w2)
+    latent = np.empty((n, len(b3)), np.float32)
+    latent[:] = b3
+    _add_layer(latent, hidden, w3)
+    action = np.empty((n, 2), np.float32)
+    action[:] = b4
+    for p in range(n):
+        for j in range(len(b3)):
+            _add(action[p], np.tanh(latent[p, j]), w4[j])
+    return action
+
+
+@njit(cache=True, error_model="numpy")
+def _add_layer(out, inputs, weights):  # type: ignore[no-untyped-def]
+    """Add relu(inputs) @ weights; four inputs at a time, since the way to memory is what takes time."""
+    lit = np.empty(inputs.shape[1], np.int64)
+    for p in range(len(out)):
+        n = 0
+        for j in range(inputs.shape[1]):
+            if inputs[p, j] > 0.0:
+                lit[n] = j
+                n += 1
+        for q in range(0, n - n % 4, 4):
+            a, b, c, d = lit[q], lit[q + 1], lit[q + 2], lit[q + 3]
+            xa, xb, xc, xd = inputs[p, a], inputs[p, b], inputs[p, c], inputs[p, d]
+            for i in range(out.shape[1]):
+                out[p, i] += xa * weights[a, i] + xb * weights[b, i] + xc * weights[c, i] + xd * weights[d, i]
+        for q in range(n - n % 4, n):
+            _add(out[p], inputs[p, lit[q]], weights[lit[q]])
+
+
+@njit(cache=True, error_model="numpy")
+def _add(out, x, weights):  # type: ignore[no-untyped-def]
+    """Add x weights."""
+    for i in range(len(out)):
+        out[i] += x * weights[i]

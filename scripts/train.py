@@ -1,0 +1,188 @@
+"""``shepherd-phys train``: learn a policy by a preset, with checkpoints from which a stopped run goes on."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import io
+import math
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from shepherd_phys.learning.folder import BEST, CURVE, POLICY, PRESET, VALIDATION, begin
+from shepherd_phys.learning.preset import Preset, load_preset
+from shepherd_phys.settings import SettingsError
+
+from .evaluate import LOG_SECONDS, _clock, _flag, _one_line, cpu_count
+
+PROG = "shepherd-phys train"
+LIBRARIES = ("torch", "stable_baselines3", "tensorboard")
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train one policy for all shepherds with PPO of stable-baselines3.
+
+    Writes into the folder --out: best.json and policy.json with their .safetensors (the best policy by validation and
+    the latest, which evaluate --controllers takes), curve.csv, validation.csv, checkpoints, and what TensorBoard reads.
+    A run that was stopped or killed goes on with --resume, exactly as if nothing had happened.
+    """
+
+    preset: Annotated[str, _flag("NAME|FILE")] = "fast"
+    """How to train: fast, paper or collie, or a TOML file of your own."""
+    reward: Annotated[str | None, _flag("NAME", "the preset's")] = None
+    """Reward scheme."""
+    seed: Annotated[int | None, _flag("S", "the preset's")] = None
+    """Root of everything random; 1,000,000 and up is meant for training."""
+    budget: Annotated[int | None, _flag("N", "the preset's")] = None
+    """Shepherd-steps (control steps times shepherds) to train for."""
+    init: Annotated[str | None, _flag("NAME|FILE", "the preset's")] = None
+    """Policy to start from: a shipped one's name or a .json file."""
+    workers: Annotated[int, _flag("W")] = cpu_count()
+    """Processes for the worlds; the results do not depend on it."""
+    out: Annotated[Path | None, _flag("DIR", "runs/PRESET-REWARD-SEED")] = None
+    """Folder of the run."""
+    resume: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Go on with the run in --out."""
+
+
+FROM_PRESET = ("reward", "seed", "budget", "init")
+"""Flags that replace a field of the preset."""
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run the command; the exit status: 0, 1 if training had to stop, 2 for a mistake of the user, 130 for Ctrl-C."""
+    try:
+        options, flags = read_options(argv)
+        missing = [name for name in LIBRARIES if importlib.util.find_spec(name) is None]
+        if missing:
+            raise SettingsError(f"{', '.join(missing)} is missing: pip install 'shepherd-phys[train]'")
+        folder, preset = prepare(options, flags)
+    except SettingsError as error:
+        return _fail(error, 2)
+    # imported only now: torch takes seconds to load, which no mistake in the flags should cost
+    from shepherd_phys.envs.team import WorkerError
+    from shepherd_phys.learning.checkpoints import CheckpointError
+    from shepherd_phys.learning.ppo import TrainingError
+    from shepherd_phys.learning.run import train
+    from shepherd_phys.learning.validation import ValidationError
+    from shepherd_phys.workers import WorkersError
+
+    print(
+        f"{folder}: {preset.worlds} worlds, {preset.n_slots} shepherds, {preset.budget:,} shepherd-steps",
+        file=sys.stderr,
+    )
+    with progress_bar() as report:
+        try:
+            best = train(folder, options.workers, report)
+        except SettingsError as error:
+            return _fail(error, 2)
+        except (CheckpointError, TrainingError, ValidationError, WorkerError, WorkersError, OSError) as error:
+            return _fail(error, 1)
+        except KeyboardInterrupt:
+            return _fail(f"stopped: --resume --out {folder} goes on from the last checkpoint", 130)
+    if best is not None:
+        print(f"best policy: score {best.score:.1f} after {best.shepherd_steps:,} shepherd-steps")
+    for name in (BEST, POLICY, CURVE, VALIDATION):
+        if (folder / name).exists():
+            print(folder / name)
+    return 0
+
+
+def read_options(argv: Sequence[str]) -> tuple[Train, set[str]]:
+    """The options from the command line, and which of them were given.
+
+    Raises:
+        SettingsError: something is unknown or impossible.
+        SystemExit: after ``--help``.
+    """
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            options = tyro.cli(Train, prog=PROG, args=list(argv))
+    except SystemExit as end:
+        if not end.code:
+            raise
+        raise SettingsError(f"{_one_line(said.getvalue())} (see {PROG} --help)") from None
+    for name, least in {"seed": 0, "budget": 1, "workers": 1}.items():
+        value = getattr(options, name)
+        if value is not None and value < least:
+            raise SettingsError(f"{name}: {value} is impossible; it must be at least {least}")
+    given = {f.name for f in fields(Train) if any(a == f"--{f.name}" or a.startswith(f"--{f.name}=") for a in argv)}
+    return options, given
+
+
+def prepare(options: Train, given: set[str]) -> tuple[Path, Preset]:
+    """The folder of the run and its preset; a new run's folder is made.
+
+    Raises:
+        SettingsError: the folder holds another run, or none to resume; or the preset is impossible.
+    """
+    changes = {name: getattr(options, name) for name in FROM_PRESET if name in given}
+    if options.resume:
+        if options.out is None:
+            raise SettingsError("--resume needs --out, the folder of the run")
+        if not (options.out / PRESET).is_file():
+            raise SettingsError(f"{options.out}: holds no run to resume (no {PRESET})")
+        preset = Preset.from_toml(options.out / PRESET)
+        wanted = load_preset(options.preset) if "preset" in given else preset
+        changed = wanted.but(**changes)
+        if changed.but(budget=preset.budget) != preset:
+            raise SettingsError(f"{options.out}: holds a run with other settings; --resume needs none but --out")
+        if "budget" in given and changed.budget != preset.budget:
+            preset = changed  # a longer run is the same run
+            preset.to_toml(options.out / PRESET)
+        return options.out, preset
+    preset = load_preset(options.preset).but(**changes)
+    folder = options.out or Path("runs") / f"{Path(options.preset).stem}-{preset.reward}-{preset.seed}"
+    begin(folder, preset)
+    return folder, preset
+
+
+@contextlib.contextmanager
+def progress_bar() -> Iterator[Any]:
+    """A bar on standard error with pace, time left and the latest measures; validations as lines."""
+    console = Console(stderr=True, markup=False, highlight=False)
+    bar = Progress(
+        BarColumn(), TextColumn("{task.percentage:.0f} %"), TextColumn("{task.fields[told]}"), TimeElapsedColumn(),
+        console=console, disable=not console.is_terminal,
+    )  # fmt: skip
+    shown = bar.add_task("training", total=None, told="starting")
+    logged = -math.inf
+
+    def report(now: Any) -> None:
+        nonlocal logged
+        steps = f"{now.shepherd_steps:,} shepherd-steps"
+        if now.validation:
+            points = ", ".join(
+                f"{row['in_goal_end']:.1f} % in, {row['path_length']:.0f} m with {row['n_flocks']} flocks"
+                + (f" n {row['cohesion']}" if len({r["cohesion"] for r in now.validation}) > 1 else "")
+                + (f" {row['n_shepherds']} shepherds" if len({r["n_shepherds"] for r in now.validation}) > 1 else "")
+                for row in now.validation
+            )
+            console.print(f"validation at {steps}: {points}", soft_wrap=True)
+            return
+        left = _clock(max(0, now.budget - now.shepherd_steps) / max(now.rate, 1e-9))
+        told = f"{now.rate:,.0f} shepherd-steps/s, {left} left"
+        if math.isfinite(now.measures["episode_reward"]):
+            told += f", reward {now.measures['episode_reward']:.2f}, {now.measures['in_goal_end']:.0f} % in"
+        bar.update(shown, total=now.budget, completed=min(now.shepherd_steps, now.budget), told=told)
+        if not console.is_terminal and time.monotonic() - logged > LOG_SECONDS:
+            logged = time.monotonic()
+            print(f"{steps}: {told}", file=sys.stderr, flush=True)
+
+    with bar:
+        yield report
+
+
+def _fail(error: object, status: int) -> int:
+    print(f"{PROG}: {' '.join(str(error).split())}", file=sys.stderr)
+    return status

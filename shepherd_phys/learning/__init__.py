@@ -1,0 +1,1 @@
+"""Learning shepherd policies with stable-baselines3: the one room for torch."""

@@ -1,0 +1,74 @@
+"""The folder of a training run: what stands in it, and its tables."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from shepherd_phys.files import whole_file
+from shepherd_phys.learning.preset import Preset
+from shepherd_phys.settings import SettingsError
+
+PRESET = "preset.toml"
+CURVE = "curve.csv"
+VALIDATION = "validation.csv"
+POLICY = "policy.json"
+BEST = "best.json"
+CHECKPOINTS = "checkpoints"
+TENSORBOARD = "tensorboard"
+
+MEASURES = ("in_goal_end", "ever_in_goal", "mean_occupancy", "path_length", "time_to_95", "success")
+"""What a validation measures, see `shepherd_phys.controllers.evaluation.run_episode`."""
+CURVE_COLUMNS = (
+    "rollout", "shepherd_steps", "decisions", "seconds", "episodes", "episode_reward", "in_goal_end", "path_length",
+    "value_loss", "policy_gradient_loss", "approx_kl", "clip_fraction", "explained_variance", "std",
+)  # fmt: skip
+"""Of ``curve.csv``, one row a rollout: counts and wall-clock seconds since the run began; means over the whole
+episodes that ended in the rollout, empty where none did; PPO's measures."""
+VALIDATION_COLUMNS = ("checkpoint", "shepherd_steps", "n_flocks", "cohesion", "n_shepherds", "trials", *MEASURES)
+"""Of ``validation.csv``, one row a validation and point."""
+
+
+def begin(folder: Path, preset: Preset) -> None:
+    """Make the folder of a new run, with its preset.
+
+    Raises:
+        SettingsError: it holds a run already, or cannot be made.
+    """
+    if (folder / PRESET).exists():
+        raise SettingsError(f"{folder} holds a run: --resume continues it; another run needs another folder")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SettingsError(f"{folder}: cannot be made ({error.strerror})") from None
+    preset.to_toml(folder / PRESET)
+
+
+class Table:
+    """A CSV file that grows row by row; what a killed run wrote after its checkpoint is cut off.
+
+    Args:
+        path: of the file.
+        columns: its columns; the first one counts.
+        last: rows that count further are cut off, and a torn one.
+    """
+
+    def __init__(self, path: Path, columns: Sequence[str], last: int) -> None:
+        self._path, self._columns = path, columns
+        rows: list[list[str]] = []
+        if path.exists():
+            with open(path, newline="", encoding="utf-8") as file:
+                rows = list(csv.reader(file))[1:]
+        kept = [row for row in rows if len(row) == len(columns) and row[0].isdecimal() and int(row[0]) <= last]
+        with whole_file(path) as part, open(part, "w", newline="", encoding="utf-8") as file:
+            csv.writer(file).writerows([list(columns), *kept])
+
+    def add(self, row: Mapping[str, Any]) -> None:
+        """Append a row; what is NaN or missing stays empty."""
+        cells = [row.get(name) for name in self._columns]
+        cells = ["" if cell is None or (isinstance(cell, float) and math.isnan(cell)) else cell for cell in cells]
+        with open(self._path, "a", newline="", encoding="utf-8") as file:
+            csv.writer(file).writerow(cells)

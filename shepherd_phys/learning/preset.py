@@ -1,0 +1,227 @@
+"""`Preset`: everything that a training run is, as one frozen value; TOML in and out; the presets by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field
+
+from shepherd_phys.controllers.network import SectorNetwork
+from shepherd_phys.envs.mixture import Mixture
+from shepherd_phys.envs.rewards import SCHEMES, Effort, Term
+from shepherd_phys.lidar import Lidar
+from shepherd_phys.scenario import SCENARIOS, Scenario
+from shepherd_phys.settings import Settings, SettingsError, read_toml, settings, write_toml
+
+FOLDER = Path(__file__).parent / "presets"
+
+
+def _listed(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
+
+
+Count = Annotated[int, Field(ge=1)]
+Counts = Annotated[tuple[Count, ...], Field(min_length=1), BeforeValidator(_listed)]
+Range = Annotated[tuple[Count, Count], BeforeValidator(_listed)]
+
+
+@settings
+class CriticNetwork(Settings):
+    """The critic: groups of its own as the actor's, joined with what it may see of the world, and two layers."""
+
+    world: int = Field(default=128, ge=1, le=4096)
+    """Width of the layer over the numbers of the world, where the critic is given them."""
+    hidden: int = Field(default=192, ge=1, le=4096)
+    """Width of the layer that joins both."""
+    latent: int = Field(default=64, ge=1, le=4096)
+    """Width of the last layer before the value."""
+
+
+@settings
+class PPOSettings(Settings):
+    """Of stable-baselines3's PPO, under its names; counts are of decisions."""
+
+    n_steps: int = Field(default=50, ge=1)
+    """Decisions of each shepherd in a rollout."""
+    batch_size: int = Field(default=2400, ge=2)
+    """Decisions in a minibatch."""
+    n_epochs: int = Field(default=4, ge=1)
+    """Passes over a rollout."""
+    learning_rate: float = Field(default=3e-4, gt=0)
+    """Of Adam."""
+    gamma: float = Field(default=0.98, gt=0, lt=1)
+    """Discount a decision."""
+    gae_lambda: float = Field(default=0.95, ge=0, le=1)
+    """lambda of the generalised advantage estimation."""
+    clip_range: float = Field(default=0.2, gt=0)
+    """Of the ratio of probabilities."""
+    ent_coef: float = Field(default=0.0, ge=0)
+    """Weight of the entropy in the loss."""
+    vf_coef: float = Field(default=0.5, ge=0)
+    """Weight of the value's error in the loss."""
+    max_grad_norm: float = Field(default=0.5, gt=0)
+    """Longer gradients are cut to this length."""
+    log_std_init: float = Field(default=-0.3, ge=-5, le=1)
+    """Logarithm of the exploration's standard deviation at the start."""
+
+
+@settings
+class Validation(Settings):
+    """How policies are judged during training: deterministic, deployed by numpy, on seeds of their own."""
+
+    flocks: Counts = (1, 2, 5)
+    """Numbers of flocks; every combination of the three lists is a point."""
+    cohesion: Counts = (40,)
+    """Neighbours n that attract a sheep."""
+    shepherds: Counts = (3,)
+    """Team sizes."""
+    trials: int = Field(default=4, ge=1)
+    """Episodes a point."""
+    seed: int = Field(default=10_000, ge=10_000, le=19_999)
+    """Root seed; trial i has the seed that `shepherd-phys evaluate --seed` gives it."""
+    every: int = Field(default=1, ge=1)
+    """Checkpoints from one validation to the next."""
+    path_cost: float = Field(default=0.0, ge=0)
+    """What a metre walked takes off the sheep delivered when the best policy is chosen [% / m]."""
+
+
+@settings
+class Preset(Settings):
+    """A training run. The defaults are what trains fast; the budget and rates are in shepherd-steps (control steps
+    times shepherds).
+    """  # noqa: D205
+
+    reward: str = "wild"
+    """Name of the reward scheme."""
+    effort: float = Field(default=0.0, ge=0)
+    """Weight of the cost of walking; 0: none."""
+    credit: Literal["own", "team"] = "own"
+    """Who is paid for a term that has shares: each shepherd by its own, or all by the mean."""
+    decision_interval: int = Field(default=5, ge=1)
+    """Control steps for which a decision is held while learning."""
+    budget: int = Field(default=6_000_000, ge=1)
+    """Shepherd-steps of the run."""
+    seed: int = Field(default=1_000_000, ge=0)
+    """Root of everything random."""
+    worlds: int = Field(default=64, ge=1)
+    """Worlds that run side by side."""
+    team_sizes: Counts = (3,)
+    """Shepherds of the worlds, in turn."""
+    n_flocks: Range | None = None
+    """Least and most flocks, drawn anew for every episode; none: the scenario's."""
+    n_neighbours: Range | None = None
+    """Least and most neighbours n, drawn anew for every episode; none: the scenario's."""
+    init: str | None = None
+    """Policy to start from: a shipped one's name, or a .json file."""
+    critic_first: int = Field(default=0, ge=0)
+    """Rollouts in which only the critic learns: a fresh one would spoil the policy given as ``init``."""
+    critic_sees: Literal["world", "own"] = "world"
+    """The whole world, or what the actor sees."""
+    checkpoint_rollouts: int = Field(default=20, ge=1)
+    """Rollouts from one checkpoint to the next. At each all worlds begin anew."""
+    threads: int = Field(default=1, ge=1)
+    """Of torch. With one, a resumed run equals the unbroken one bit for bit."""
+    scenario: Scenario = Scenario()
+    lidar: Lidar = Lidar(sectors=64, frame="goal")
+    network: SectorNetwork = SectorNetwork()
+    critic: CriticNetwork = CriticNetwork()
+    ppo: PPOSettings = PPOSettings()
+    validation: Validation = Validation()
+
+    def __post_init__(self) -> None:
+        if self.reward not in SCHEMES:
+            raise ValueError(f"reward: {self.reward!r} is not one of {', '.join(SCHEMES)}")
+        try:
+            self.network.shapes(self.lidar)
+            self.draw()
+        except SettingsError as error:
+            raise ValueError(str(error)) from None
+        if self.ppo.batch_size > self.n_slots * self.ppo.n_steps:
+            raise ValueError(
+                f"ppo.batch_size: {self.ppo.batch_size} is more than a rollout holds: "
+                f"{self.n_slots} shepherds x {self.ppo.n_steps} decisions"
+            )
+        if self.init is None and self.critic_first:
+            raise ValueError("critic_first: makes sense only with init")
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Shepherds of each world."""
+        return tuple(self.team_sizes[i % len(self.team_sizes)] for i in range(self.worlds))
+
+    @property
+    def n_slots(self) -> int:
+        """Shepherds of all worlds."""
+        return sum(self.sizes)
+
+    def draw(self) -> Scenario | Mixture:
+        """The scenario, or what draws one for each episode."""
+        if self.n_flocks is None and self.n_neighbours is None:
+            return self.scenario
+        n_flocks = self.n_flocks or (self.scenario.n_flocks, self.scenario.n_flocks)
+        return Mixture(base=self.scenario, n_flocks=n_flocks, n_neighbours=self.n_neighbours)
+
+    def scheme(self) -> dict[str, tuple[float, Term]]:
+        """The reward scheme, with the cost of walking if there is one."""
+        scheme = dict(SCHEMES[self.reward])
+        if self.effort:
+            scheme["effort"] = (-self.effort, Effort())
+        return scheme
+
+    @classmethod
+    def from_dict(cls, table: Mapping[str, Any]) -> Preset:
+        """The preset that plain data describe; what is left out keeps its default.
+
+        Raises:
+            SettingsError: a field is unknown or impossible.
+        """
+        values = dict(table)
+        if isinstance(values.get("scenario"), str) and values["scenario"] in SCENARIOS:
+            values["scenario"] = SCENARIOS[values["scenario"]]
+        for name, made in PARTS.items():
+            if name in values and not isinstance(values[name], Scenario):
+                if not isinstance(values[name], Mapping):
+                    raise SettingsError(f"Preset.{name}: must be a table (given: {values[name]!r})")
+                values[name] = made(values[name])
+        return cls(**values)
+
+    @classmethod
+    def from_toml(cls, path: str | Path) -> Preset:
+        """Read a preset from a TOML file; see `from_dict`."""
+        table = read_toml(path)
+        try:
+            return cls.from_dict(table)
+        except SettingsError as error:
+            raise SettingsError(f"{path}: {error}") from None
+
+    def to_toml(self, path: str | Path) -> None:
+        """Write the preset as a TOML file."""
+        write_toml(self.to_dict(), path)
+
+
+PARTS: dict[str, Callable[[Mapping[str, Any]], Any]] = {
+    "scenario": Scenario.from_dict,
+    "lidar": lambda table: Lidar(**table),
+    "network": lambda table: SectorNetwork(**table),
+    "critic": lambda table: CriticNetwork(**table),
+    "ppo": lambda table: PPOSettings(**table),
+    "validation": lambda table: Validation(**table),
+}
+PRESETS = {path.stem: path for path in sorted(FOLDER.glob("*.toml"))}
+"""The presets that come with the package, by name."""
+
+
+def load_preset(name_or_path: str | Path) -> Preset:
+    """A preset by its name, or from a TOML file.
+
+    Raises:
+        SettingsError: it is neither, or the file is not a preset.
+    """
+    name = str(name_or_path)
+    if name in PRESETS:
+        return Preset.from_toml(PRESETS[name])
+    if name.endswith(".toml"):
+        return Preset.from_toml(name)
+    raise SettingsError(f"preset: {name!r} is neither a .toml file nor one of {', '.join(PRESETS)}")

@@ -1,0 +1,114 @@
+"""Judging a policy during training: as deployed, on validation seeds, in processes of its own or in this one."""
+
+from __future__ import annotations
+
+import json
+from collections import deque
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from shepherd_phys.controllers.evaluation import run_episode, trial_seed
+from shepherd_phys.controllers.learned import Policy
+from shepherd_phys.envs.shepherding import ShepherdingEnv
+from shepherd_phys.learning.folder import MEASURES
+from shepherd_phys.learning.preset import Preset
+from shepherd_phys.scenario import Scenario
+from shepherd_phys.workers import Job, Workers, finished
+
+TIMEOUT = 600.0
+"""An episode that takes longer is lost [s]."""
+
+
+class ValidationError(RuntimeError):
+    """An episode of a validation did not end; the message says why."""
+
+
+class Play(NamedTuple):
+    """A policy in a world: what a worker is sent."""
+
+    policy: Policy
+    scenario: Scenario
+
+
+def episode(play: Play, seed: int) -> Mapping[str, Any]:
+    """Run one episode."""
+    env = ShepherdingEnv(play.scenario, rewards={}, lidar=play.policy.lidar)
+    return run_episode(play.policy, env, seed)
+
+
+class Validator:
+    """Runs the validation of a preset.
+
+    Args:
+        preset: the run.
+        workers: processes that run episodes; None: this process does.
+    """
+
+    def __init__(self, preset: Preset, workers: Workers | None = None) -> None:
+        self._settings = preset.validation
+        self._workers = workers
+        self.points = [
+            {"n_flocks": n_flocks, "cohesion": cohesion, "n_shepherds": n_shepherds}
+            for n_flocks in self._settings.flocks
+            for cohesion in self._settings.cohesion
+            for n_shepherds in self._settings.shepherds
+        ]
+        """What the worlds are, in order."""
+        self._scenarios = [_scenario(preset.scenario, point) for point in self.points]
+        self._seeds = [trial_seed(self._settings.seed, trial) for trial in range(self._settings.trials)]
+
+    def __call__(self, policy: Policy) -> list[dict[str, Any]]:
+        """Mean measures of the policy at each point; see `shepherd_phys.controllers.evaluation.run_episode`.
+
+        Raises:
+            ValidationError: an episode did not end.
+        """
+        jobs = [
+            Job((i, seed), Play(policy, scenario), seed)
+            for i, scenario in enumerate(self._scenarios)
+            for seed in self._seeds
+        ]
+        rows: dict[tuple[int, int], Mapping[str, Any]] = {}
+        if self._workers is None:
+            rows = {job.key: episode(job.spec, job.seed) for job in jobs}
+        else:
+            for ended in finished(self._workers, deque(jobs)):
+                if ended.result is None:
+                    raise ValidationError(f"validation, seed {ended.key[1]}: {ended.cause}")
+                rows[ended.key] = json.loads(ended.result)
+        return [
+            {
+                **point,
+                "trials": len(self._seeds),
+                **{name: float(np.mean([rows[i, seed][name] for seed in self._seeds])) for name in MEASURES},
+            }
+            for i, point in enumerate(self.points)
+        ]
+
+    def score(self, rows: list[dict[str, Any]]) -> float:
+        """What the best policy has most of: percent of the sheep in at the end, mean over the points, less walking."""
+        delivered = float(np.mean([row["in_goal_end"] for row in rows]))
+        return delivered - self._settings.path_cost * float(np.mean([row["path_length"] for row in rows]))
+
+
+@contextmanager
+def validator(preset: Preset, n_workers: int) -> Iterator[Validator]:
+    """A `Validator` with ``n_workers`` processes of its own; with fewer than 2, this process does it."""
+    if n_workers < 2:
+        yield Validator(preset)
+        return
+    with Workers(episode, n_workers, TIMEOUT) as workers:
+        yield Validator(preset, workers)
+
+
+def _scenario(base: Scenario, point: Mapping[str, Any]) -> Scenario:
+    """The scenario of a point."""
+    flock = base.flock
+    if hasattr(flock, "n_neighbours") and hasattr(flock, "but"):
+        flock = flock.but(n_neighbours=point["cohesion"])
+    bodies = base.shepherds
+    team = tuple(bodies[k % len(bodies)] for k in range(point["n_shepherds"]))
+    return base.but(n_flocks=point["n_flocks"], flock=flock, shepherds=team)

@@ -1,0 +1,303 @@
+"""Networks, export and learning: torch and numpy agree; the actor sees its lidar alone; a NaN is named."""
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from stable_baselines3 import PPO
+from test_learned import LIDAR, SMALL, random_weights, spec_of
+
+from shepherd_phys.controllers import Policy, load_policy
+from shepherd_phys.controllers.network import Actor, SectorNetwork, input_shape
+from shepherd_phys.controllers.policy_files import PolicyError
+from shepherd_phys.envs.team import TeamVecEnv
+from shepherd_phys.learning.export import actor_weights, load_actor, to_policy, to_sb3
+from shepherd_phys.learning.export import spec_of as spec_of_preset
+from shepherd_phys.learning.network import TeamPolicy
+from shepherd_phys.learning.ppo import Learner, TrainingError
+from shepherd_phys.learning.preset import PRESETS, CriticNetwork, PPOSettings, Preset, Validation, load_preset
+from shepherd_phys.learning.validation import Validator
+from shepherd_phys.lidar import Lidar
+from shepherd_phys.scenario import SCENARIOS
+from shepherd_phys.settings import SettingsError
+
+TINY = Preset(
+    scenario=SCENARIOS["small"].but(n_steps=40),
+    worlds=2,
+    team_sizes=(1, 2),
+    lidar=LIDAR,
+    network=SMALL,
+    critic=CriticNetwork(world=6, hidden=8, latent=5),
+    ppo=PPOSettings(n_steps=8, batch_size=12, n_epochs=2),
+    validation=Validation(flocks=(1,), trials=1, shepherds=(2,)),
+    checkpoint_rollouts=2,
+    budget=360,
+)
+
+
+@pytest.fixture
+def learner():
+    made = Learner(TINY)
+    made.restart(0)
+    yield made
+    made.close()
+
+
+def policy_of(lidar, network, critic_numbers=0, seed=0):
+    torch.manual_seed(seed)
+    seen = {"lidar": spaces.Box(0.0, 1.0, input_shape(lidar), np.float32)}
+    if critic_numbers:
+        seen["critic"] = spaces.Box(-np.inf, np.inf, (critic_numbers,), np.float32)
+    return TeamPolicy(
+        spaces.Dict(seen), spaces.Box(-1.0, 1.0, (2,), np.float32), lambda _: 1e-3, network=network, critic=None
+    )
+
+
+CASES = {
+    "fast": (Lidar(sectors=64, frame="goal"), SectorNetwork()),
+    "fast, overlapping": (Lidar(sectors=64, frame="goal"), SectorNetwork(overlap=3)),
+    "paper": (Lidar(), SectorNetwork(group=8)),
+    "four channels": (Lidar(channels=("sheep", "shepherds", "goal", "obstacles"), sectors=64), SectorNetwork()),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_torch_and_numpy_agree(name, tmp_path):
+    lidar, network = CASES[name]
+    policy = policy_of(lidar, network)
+    with torch.no_grad():
+        for parameter in policy.parameters():  # the last layer begins near 0, which would hide a difference
+            parameter.add_(0.05 * torch.randn_like(parameter))
+    rng = np.random.default_rng(1)
+    shape = (50, *input_shape(lidar))
+    observation = rng.random(shape, dtype=np.float32) * (rng.random(shape) < rng.random((50, 1, 1)))
+    with torch.no_grad():
+        wanted = policy.get_distribution({"lidar": torch.from_numpy(observation)}).mode().numpy()
+    assert np.abs(wanted).max() > 0.1
+    exported = to_policy(policy, spec_of(lidar, network), tmp_path / "p.json")
+    assert Actor(network, lidar, exported.weights)(observation) == pytest.approx(wanted, abs=1e-5)
+    back = to_sb3(load_policy(tmp_path / "p.json"), critic_numbers=7)
+    action, _ = back.predict({"lidar": observation, "critic": np.zeros((50, 7), np.float32)}, deterministic=True)
+    assert action == pytest.approx(np.clip(wanted, -1, 1), abs=1e-6)
+
+
+def test_the_actor_sees_its_lidar_alone_and_the_critic_the_world():
+    policy = policy_of(LIDAR, SMALL, critic_numbers=4)
+    observation = {
+        "lidar": torch.rand((3, 6, 16)),
+        "critic": torch.rand((3, 4)),
+    }
+    other = {**observation, "critic": torch.rand((3, 4))}
+    with torch.no_grad():
+        assert torch.equal(policy.get_distribution(observation).mode(), policy.get_distribution(other).mode())
+        assert not torch.equal(policy.predict_values(observation), policy.predict_values(other))
+    actor = set(actor_weights(policy))
+    assert actor == set(SMALL.shapes(LIDAR))
+
+
+def test_actor_and_critic_share_no_weight():
+    policy = policy_of(LIDAR, SMALL)
+    observation = {"lidar": torch.rand((3, 6, 16))}
+    before = policy.predict_values(observation)
+    load_actor(policy, random_weights(SMALL, LIDAR, seed=9))
+    assert torch.equal(before, policy.predict_values(observation))
+
+
+def test_weights_begin_orthogonal_and_actions_small():
+    policy = policy_of(Lidar(sectors=64, frame="goal"), SectorNetwork())
+    weights = actor_weights(policy)
+    hidden = weights["hidden.weight"]
+    assert hidden @ hidden.T == pytest.approx(2 * np.eye(192), abs=1e-4)
+    assert np.linalg.norm(weights["action.weight"], axis=1) == pytest.approx(0.01, rel=1e-3)
+
+
+def test_only_a_model_of_the_right_sizes_becomes_a_policy():
+    with pytest.raises(PolicyError, match="the spec tells"):
+        to_policy(policy_of(LIDAR, SMALL.but(hidden=9)), spec_of())
+    env = TeamVecEnv(TINY.scenario, (1,), lidar=LIDAR)
+    with pytest.raises(PolicyError, match="only a TeamPolicy.*MultiInputActorCriticPolicy"):
+        to_policy(PPO("MultiInputPolicy", env, n_steps=4, batch_size=4), spec_of())
+    env.close()
+    with pytest.raises(PolicyError, match="of another size"):
+        load_actor(policy_of(LIDAR, SMALL), random_weights(SMALL.but(hidden=9), LIDAR))
+
+
+def test_a_live_model_is_exported_and_goes_on(learner, tmp_path):
+    """Export to a file, and back into a plain PPO of stable-baselines3 that learns on."""
+    policy = to_policy(learner.model, spec_of_preset(TINY, 5), tmp_path / "p.json")
+    assert policy.checksum == load_policy(tmp_path / "p.json").checksum
+    assert policy.spec.training["shepherd_steps"] == 5
+    assert policy.spec.rewards["terms"]["occlude"]["weight"] == 0.1
+    sizes = {"network": SMALL, "critic": TINY.critic}
+    model = PPO(TeamPolicy, learner.env, n_steps=8, batch_size=12, policy_kwargs=sizes, seed=3)
+    load_actor(model.policy, policy.weights)
+    np.testing.assert_array_equal(actor_weights(model.policy)["hidden.weight"], policy.weights["hidden.weight"])
+    model.learn(24)
+    assert not np.array_equal(actor_weights(model.policy)["hidden.weight"], policy.weights["hidden.weight"])
+
+
+# ------------------------------------------------------------------- learning
+
+
+def test_a_rollout_changes_everything_and_measures_whole_episodes(learner):
+    before = learner.state()[0]
+    found = [learner.learn() for _ in range(3)]
+    after, facts = learner.state()
+    for name in before:
+        assert not np.array_equal(before[name], after[name]), name
+    assert {name for name in after if name.startswith("adam/")}
+    assert facts["rollouts"] == 3 and facts["decisions"] == 3 * 8 * 3
+    assert facts["shepherd_steps"] == learner.env.shepherd_steps
+    assert sum(one["episodes"] for one in found) > 0
+    for one in found:
+        assert np.isfinite(one["value_loss"])
+        assert np.isfinite(one["episode_reward"]) == (one["episodes"] > 0)
+
+
+def test_at_first_only_the_critic_learns(tmp_path):
+    to_policy(policy_of(LIDAR, SMALL, seed=4), spec_of_preset(TINY), tmp_path / "p.json")
+    learner = Learner(TINY.but(init=str(tmp_path / "p.json"), critic_first=1))
+    learner.restart(0)
+    actor = load_policy(tmp_path / "p.json").weights
+    critic = learner.policy.value_net.weight.detach().clone()
+    learner.learn()
+    for name, array in actor_weights(learner.policy).items():
+        np.testing.assert_array_equal(array, np.full(2, -0.3, np.float32) if name == "log_std" else actor[name])
+    assert not torch.equal(critic, learner.policy.value_net.weight)
+    learner.learn()
+    for name, array in actor_weights(learner.policy).items():
+        assert not np.array_equal(array, actor[name]), name
+    learner.close()
+
+
+def test_a_policy_to_start_from_must_fit(tmp_path):
+    to_policy(policy_of(LIDAR, SMALL), spec_of_preset(TINY), tmp_path / "p.json")
+    with pytest.raises(SettingsError, match="init: .* has another network"):
+        Learner(TINY.but(init=str(tmp_path / "p.json"), network=SMALL.but(latent=9)))
+    with pytest.raises(PolicyError, match="cannot be read"):
+        Learner(TINY.but(init=str(tmp_path / "q.json")))
+
+
+@pytest.mark.parametrize("where", ["rewards", "lidar", "critic"])
+def test_a_nan_of_the_worlds_is_named(where, learner, monkeypatch):
+    step = learner.env.step_wait
+
+    def broken():
+        observation, rewards, dones, infos = step()
+        (rewards if where == "rewards" else observation[where])[1] = np.nan
+        return observation, rewards, dones, infos
+
+    monkeypatch.setattr(learner.env, "step_wait", broken)
+    with pytest.raises(TrainingError, match=where):
+        learner.learn()
+
+
+def test_a_nan_of_the_network_is_named(learner):
+    with torch.no_grad():
+        learner.policy.pi_features_extractor.hidden.weight[0, 0] = np.inf
+    with pytest.raises(TrainingError, match=r"features_extractor\.hidden\.weight"):
+        learner.learn()
+
+
+def test_a_nan_of_the_loss_is_named(learner, monkeypatch):
+    learn = learner.model.learn
+
+    def broken(*args, **options):
+        learn(*args, **options)
+        learner.model.logger.record("train/value_loss", np.nan)
+
+    monkeypatch.setattr(learner.model, "learn", broken)
+    with pytest.raises(TrainingError, match="train/value_loss is nan"):
+        learner.learn()
+
+
+def test_validation_is_an_evaluation_on_its_own_seeds_and_disturbs_nothing(learner):
+    policy = to_policy(learner.model, spec_of_preset(TINY))
+    state = torch.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002 (stable-baselines3 draws from it)
+    validator = Validator(TINY.but(validation=Validation(flocks=(1, 2), cohesion=(5, 8), shepherds=(2,), trials=2)))
+    rows = validator(policy)
+    assert [(row["n_flocks"], row["cohesion"], row["n_shepherds"]) for row in rows] == [
+        (1, 5, 2), (1, 8, 2), (2, 5, 2), (2, 8, 2),
+    ]  # fmt: skip
+    assert validator(policy) == rows
+    assert torch.equal(torch.get_rng_state(), state[0])
+    assert np.array_equal(np.random.get_state()[1], state[1])  # noqa: NPY002
+    rows = [{"in_goal_end": 90.0, "path_length": 200.0}, {"in_goal_end": 100.0, "path_length": 100.0}]
+    assert validator.score(rows) == 95.0
+    costly = Validator(TINY.but(validation=TINY.validation.but(path_cost=0.1)))
+    assert costly.score(rows) == pytest.approx(80.0)
+
+
+# ------------------------------------------------------------------- presets
+
+
+def test_presets_are_read_and_written(tmp_path):
+    assert {"fast", "paper", "collie"} <= set(PRESETS)
+    for name in PRESETS:
+        preset = load_preset(name)
+        preset.to_toml(tmp_path / "p.toml")
+        assert load_preset(tmp_path / "p.toml") == preset
+    TINY.to_toml(tmp_path / "p.toml")
+    assert load_preset(tmp_path / "p.toml") == TINY
+    assert load_preset("fast").but(budget=1) == Preset(budget=1)
+
+
+def test_the_papers_preset_is_the_papers():
+    paper = load_preset("paper")
+    assert paper.lidar == Lidar() and paper.lidar.observation_shape(1) == (1, 9, 512)
+    assert (paper.decision_interval, paper.credit, paper.critic_sees) == (1, "team", "own")
+    assert (paper.budget, paper.scenario, set(paper.sizes)) == (300_000_000, SCENARIOS["paper"], {1, 2, 3, 4, 5, 6})
+    assert paper.scheme()["distance"][1].norm == "NT" and not paper.effort
+
+
+def test_a_preset_may_mix_worlds_and_price_effort():
+    preset = TINY.but(n_flocks=(1, 3), effort=2.0, worlds=5, team_sizes=(3, 1))
+    assert preset.sizes == (3, 1, 3, 1, 3) and preset.n_slots == 11
+    drawn = preset.draw()(np.random.default_rng(0), 0)
+    assert 1 <= drawn.n_flocks <= 3 and drawn.flock == TINY.scenario.flock
+    assert preset.scheme()["effort"][0] == -2.0
+    assert TINY.draw() == TINY.scenario
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("reward = 'wold'", "'wold' is not one of original, any, wild"),
+        ("rewards = 'wild'", "rewards: there is no such field"),
+        ("budget = 0", "budget.*greater than or equal to 1"),
+        ("team_sizes = []", "team_sizes"),
+        ("team_sizes = [0]", "team_sizes"),
+        ("critic_first = 3", "critic_first: makes sense only with init"),
+        ("lidar = 3", "lidar: must be a table"),
+        ("scenario = 'moon'", "scenario: must be a table"),
+        ("n_flocks = [5, 2]", "smaller number comes first"),
+        ("[lidar]\nlayout = 'paper'", "takes 'rows'"),
+        ("[network]\ngroup = 7", "must divide"),
+        ("[network]\ndepth = 7", "depth: there is no such field"),
+        ("[ppo]\nbatch_size = 100000", "more than a rollout holds"),
+        ("[ppo]\ngamma = 1.5", "gamma"),
+        ("[validation]\nseed = 20000", "seed"),
+        ("[scenario]\nn_sheep = 0", "n_sheep"),
+        ("budget =", "is not a TOML file"),
+    ],
+)
+def test_a_wrong_preset_is_one_error(text, said, tmp_path):
+    (tmp_path / "mine.toml").write_text(text)
+    with pytest.raises(SettingsError, match=said) as caught:
+        load_preset(tmp_path / "mine.toml")
+    assert "mine.toml" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_preset_that_is_not_there_is_one_error(tmp_path):
+    with pytest.raises(SettingsError, match="neither a .toml file nor one of"):
+        load_preset("fats")
+    with pytest.raises(SettingsError, match="cannot be read"):
+        load_preset(tmp_path / "no.toml")
+
+
+def test_a_policy_that_was_trained_deploys_where_it_was_not(learner):
+    """Team sizes other than those of training."""
+    policy = to_policy(learner.model, spec_of_preset(TINY))
+    assert isinstance(policy, Policy)
+    rows = Validator(TINY.but(validation=Validation(flocks=(3,), shepherds=(1, 6), trials=1)))(policy)
+    assert [row["n_shepherds"] for row in rows] == [1, 6]

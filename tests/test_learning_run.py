@@ -1,0 +1,257 @@
+"""Training runs: killed and resumed they equal the unbroken one; checkpoints are whole or not there."""
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import safetensors.numpy
+from test_learning import TINY
+
+from shepherd_phys.controllers import load_policy
+from shepherd_phys.learning import checkpoints
+from shepherd_phys.learning.checkpoints import Checkpoint, CheckpointError
+from shepherd_phys.learning.folder import CURVE_COLUMNS, Table, begin
+from shepherd_phys.learning.preset import load_preset
+from shepherd_phys.learning.run import best_policy, train
+from shepherd_phys.settings import SettingsError
+
+# 3 slots x 8 decisions x 5 control steps = 120 a rollout, a few fewer where an episode is cut short; 2 rollouts a
+# checkpoint: three checkpoints
+PRESET = TINY.but(budget=600)
+
+
+class Killed(Exception):
+    """What the runs below die of."""
+
+
+@pytest.fixture(scope="module")
+def unbroken(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("unbroken") / "run"
+    begin(folder, PRESET)
+    train(folder)
+    return folder
+
+
+def rows_of(path):
+    with open(path, newline="", encoding="utf-8") as file:
+        return [{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(file)]
+
+
+def assert_same_run(a, b):
+    """To the bit: parameters, Adam's moments, the normaliser, counters, the best policy; and the tables."""
+    one, other = checkpoints.load_latest(a / "checkpoints"), checkpoints.load_latest(b / "checkpoints")
+    assert one.number == other.number == 3
+    assert set(one.arrays) == set(other.arrays)
+    for name, array in one.arrays.items():
+        np.testing.assert_array_equal(array, other.arrays[name], err_msg=name)
+    assert {**one.facts, "seconds": 0} == {**other.facts, "seconds": 0}
+    for name in ("curve.csv", "validation.csv"):
+        assert rows_of(a / name) == rows_of(b / name)
+    for name in ("policy.json", "best.json"):
+        assert load_policy(a / name).checksum == load_policy(b / name).checksum
+
+
+@pytest.mark.parametrize("rollouts", [1, 2, 3, 5])
+def test_a_run_that_was_stopped_and_resumed_is_the_unbroken_one(rollouts, unbroken, tmp_path):
+    begin(tmp_path, PRESET)
+    seen = []
+
+    def report(progress):
+        seen.append(progress)
+        if sum(not p.validation for p in seen) >= rollouts:
+            raise Killed
+
+    with pytest.raises(Killed):
+        train(tmp_path, report=report)
+    train(tmp_path)
+    assert_same_run(tmp_path, unbroken)
+
+
+@pytest.mark.slow
+def test_a_run_that_was_killed_by_force_again_and_again_is_the_unbroken_one(unbroken, tmp_path):
+    begin(tmp_path, PRESET)
+    code = f"from pathlib import Path\nfrom shepherd_phys.learning.run import train\ntrain(Path({str(tmp_path)!r}))"
+    for _ in range(3):
+        process = subprocess.Popen([sys.executable, "-P", "-c", code])
+        before = sum(1 for _ in tmp_path.glob("curve.csv") for _ in rows_of(tmp_path / "curve.csv"))
+        until = time.monotonic() + 120
+        while process.poll() is None and time.monotonic() < until:
+            rows = rows_of(tmp_path / "curve.csv") if (tmp_path / "curve.csv").exists() else []
+            if len(rows) > before:
+                break
+            time.sleep(0.05)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    train(tmp_path)
+    assert_same_run(tmp_path, unbroken)
+
+
+@pytest.mark.slow
+def test_worker_processes_change_nothing(unbroken, tmp_path):
+    begin(tmp_path, PRESET)
+    train(tmp_path, n_workers=2)
+    assert_same_run(tmp_path, unbroken)
+
+
+def test_another_seed_is_another_run(unbroken, tmp_path):
+    begin(tmp_path, PRESET.but(seed=2_000_000, budget=120))
+    train(tmp_path)
+    assert rows_of(tmp_path / "curve.csv")[0] != rows_of(unbroken / "curve.csv")[0]
+
+
+def test_what_a_run_leaves(unbroken):
+    names = {path.name for path in unbroken.iterdir()}
+    assert names == {
+        "preset.toml", "curve.csv", "validation.csv", "checkpoints", "tensorboard",
+        "policy.json", "policy.safetensors", "best.json", "best.safetensors",
+    }  # fmt: skip
+    assert load_preset(unbroken / "preset.toml") == PRESET
+    assert sorted(os.listdir(unbroken / "checkpoints")) == [f"checkpoint-00000{i}.safetensors" for i in (2, 3)]
+    assert [path.name for path in (unbroken / "tensorboard").iterdir()]
+    curve = rows_of(unbroken / "curve.csv")
+    assert [int(row["rollout"]) for row in curve] == list(range(1, len(curve) + 1))
+    steps = [int(row["shepherd_steps"]) for row in curve]
+    assert steps == sorted(steps) and steps[-2] < PRESET.budget <= steps[-1]
+    rewards = [row["episode_reward"] for row in curve]
+    assert any(rewards) and all(text == "" or np.isfinite(float(text)) for text in rewards)
+    checked = rows_of(unbroken / "validation.csv")
+    assert [row["checkpoint"] for row in checked] == ["1", "2", "3"]
+    assert best_policy(unbroken).spec.training["shepherd_steps"] in [int(row["shepherd_steps"]) for row in checked]
+    assert load_policy(unbroken / "policy.json").spec.training["shepherd_steps"] == steps[-1]
+
+
+def test_a_finished_run_is_not_trained_further(unbroken, tmp_path):
+    before = checkpoints.load_latest(unbroken / "checkpoints")
+    train(unbroken)
+    after = checkpoints.load_latest(unbroken / "checkpoints")
+    assert after.facts == before.facts
+
+
+def test_a_folder_holds_one_run(unbroken):
+    with pytest.raises(SettingsError, match="holds a run: --resume continues it"):
+        begin(unbroken, PRESET)
+
+
+# --------------------------------------------------------------- checkpoints
+
+ARRAYS = {"a": np.arange(6, dtype=np.float32).reshape(2, 3), "b": np.array(1.5), "c": np.zeros((2, 3)).T}
+
+
+def test_checkpoints_are_read_as_they_were_written_and_two_are_kept(tmp_path):
+    for number in (1, 2, 3, 11):
+        checkpoints.save(tmp_path, Checkpoint(number, ARRAYS, {"x": 0.1, "n": number}))
+    assert sorted(os.listdir(tmp_path)) == ["checkpoint-000003.safetensors", "checkpoint-000011.safetensors"]
+    read = checkpoints.load_latest(tmp_path)
+    assert (read.number, read.facts) == (11, {"x": 0.1, "n": 11})
+    for name, array in ARRAYS.items():
+        np.testing.assert_array_equal(read.arrays[name], array)
+        assert read.arrays[name].dtype == array.dtype
+
+
+def test_a_damaged_checkpoint_gives_way_to_the_one_before(tmp_path):
+    first = checkpoints.save(tmp_path, Checkpoint(1, ARRAYS, {}))
+    second = checkpoints.save(tmp_path, Checkpoint(2, ARRAYS, {}))
+    whole = second.read_bytes()
+    for damaged in (b"", whole[:50], whole[:-1], whole[:-1] + b"\x07", b"\x80\x04pickle"):
+        second.write_bytes(damaged)
+        assert checkpoints.load_latest(tmp_path).number == 1
+    first.write_bytes(b"")
+    with pytest.raises(CheckpointError, match="checkpoint-000002.safetensors: is not a checkpoint"):
+        checkpoints.load_latest(tmp_path)
+
+
+def test_files_that_are_no_checkpoints_are_left_alone(tmp_path):
+    assert checkpoints.load_latest(tmp_path) is None
+    assert checkpoints.load_latest(tmp_path / "nowhere") is None
+    for name in ("checkpoint-000007.safetensors.part", "notes.txt"):
+        (tmp_path / name).write_bytes(b"half")
+    assert checkpoints.load_latest(tmp_path) is None
+    safetensors.numpy.save_file({"a": np.zeros(1)}, tmp_path / "checkpoint-000001.safetensors")
+    with pytest.raises(CheckpointError, match="is not a checkpoint"):
+        checkpoints.load(tmp_path / "checkpoint-000001.safetensors")
+
+
+def test_a_checkpoint_that_cannot_be_written_costs_no_other(tmp_path, monkeypatch):
+    checkpoints.save(tmp_path, Checkpoint(1, ARRAYS, {}))
+
+    def full(self, content):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(CheckpointError, match="No space left"):
+        checkpoints.save(tmp_path, Checkpoint(2, ARRAYS, {}))
+    assert os.listdir(tmp_path) == ["checkpoint-000001.safetensors"]
+    assert checkpoints.load_latest(tmp_path).number == 1
+
+
+def test_a_table_goes_on_where_the_checkpoint_was(tmp_path):
+    table = Table(tmp_path / "curve.csv", CURVE_COLUMNS, 0)
+    for rollout in (1, 2, 3):
+        table.add({"rollout": rollout, "episode_reward": float("nan"), "in_goal_end": 1.5})
+    with open(tmp_path / "curve.csv", "a") as file:
+        file.write("4,12")  # torn
+    table = Table(tmp_path / "curve.csv", CURVE_COLUMNS, 2)
+    table.add({"rollout": 3})
+    rows = rows_of(tmp_path / "curve.csv")
+    assert [row["rollout"] for row in rows] == ["1", "2", "3"]
+    assert (rows[0]["episode_reward"], rows[0]["in_goal_end"], rows[2]["in_goal_end"]) == ("", "1.5", "")
+
+
+# ------------------------------------------------------------------ command
+
+
+def shepherd_phys(*words, cwd):
+    command = Path(sys.executable).parent / "shepherd-phys"
+    return subprocess.run([str(command), *words], cwd=cwd, capture_output=True, text=True, timeout=300, check=False)
+
+
+@pytest.mark.slow
+def test_the_command_trains_resumes_and_evaluates(tmp_path):
+    TINY.but(budget=200).to_toml(tmp_path / "tiny.toml")
+    first = ("train", "--preset", "tiny.toml", "--reward", "original", "--seed", "1000007", "--workers", "1")
+    run = shepherd_phys(*first, cwd=tmp_path)
+    assert run.returncode == 0, run.stderr
+    folder = Path("runs/tiny-original-1000007")
+    assert run.stdout.splitlines()[1:] == [
+        str(folder / name) for name in ("best.json", "policy.json", "curve.csv", "validation.csv")
+    ]
+    assert "validation at" in run.stderr
+    run = shepherd_phys(*first, cwd=tmp_path)
+    assert run.returncode == 2 and "--resume continues it" in run.stderr
+    run = shepherd_phys("train", "--resume", "--out", str(folder), "--budget", "500", "--workers", "1", cwd=tmp_path)
+    assert run.returncode == 0, run.stderr
+    assert int(rows_of(tmp_path / folder / "curve.csv")[-1]["shepherd_steps"]) >= 500
+    run = shepherd_phys("train", "--resume", "--out", str(folder), "--reward", "any", cwd=tmp_path)
+    assert run.returncode == 2 and "other settings" in run.stderr
+    command = ("evaluate", "--controllers", str(folder / "best.json"), "--scenario", "small")
+    run = shepherd_phys(*command, "--trials", "1", "--workers", "1", cwd=tmp_path)
+    assert run.returncode == 0, run.stderr
+    (tmp_path / folder / "best.safetensors").write_bytes(b"")
+    run = shepherd_phys(*command, cwd=tmp_path)
+    assert run.returncode == 2 and len(run.stderr.splitlines()) == 1 and "is damaged" in run.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--preset", "fats"], "neither a .toml file nor one of"),
+        (["--reward", "wold"], "'wold' is not one of"),
+        (["--workers", "0"], "workers: 0 is impossible"),
+        (["--seed", "-1"], "seed: -1 is impossible"),
+        (["--budget", "many"], "--budget"),
+        (["--resume"], "--resume needs --out"),
+        (["--resume", "--out", "nowhere"], "holds no run to resume"),
+        (["--moon"], "--moon"),
+        (["--init", "no.json", "--out", "x", "--workers", "1"], "no.json: cannot be read"),
+    ],
+)
+def test_a_mistake_is_one_line(words, said, tmp_path):
+    run = shepherd_phys("train", *words, cwd=tmp_path)
+    assert run.returncode == 2
+    assert said in run.stderr.splitlines()[-1] and "Traceback" not in run.stderr
