@@ -57,7 +57,7 @@ def parsed(cls: type[T], prog: str, argv: Sequence[str]) -> tuple[T, set[str]]:
         argv: its words.
 
     Raises:
-        SettingsError: the words are no such options, said in one line; or --scheduler is no address, or goes with --workers.
+        SettingsError: the words are no such options; --scheduler is no address, or is given with --workers. One line.
         SystemExit: after ``--help``.
     """
     said = io.StringIO()
