@@ -32,7 +32,6 @@ PROPOSED = ("wild", "any")
 LEARNED = ("original", "any", "wild", "collie")
 LITERAL = ("strombom-literal", "pierson-reconstructed", "elfiqi-literal")
 """As published, without a terminal rule: never a rival, never counted."""
-FLOOR = ("random", "idle")
 COUNTED = (*HEURISTICS, "original", "any", "wild")
 """Methods that c6 and c7 are about; what others show is reported beside it."""
 

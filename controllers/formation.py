@@ -123,8 +123,11 @@ class Team:
         """The state as the method is to see it: its goal is where the flock at work has to go first."""
         if not state.obstacles or self._routes is None or self._at is None:
             return state
-        place = self._routes[2].towards(self._at[None], state.goal_pos[None])[0]
-        return state if np.array_equal(place, state.goal_pos) else state.but(goal_pos=place)
+        goal, routes = state.goal_pos[None], self._routes[2]
+        place = routes.towards(self._at[None], goal)[0]
+        # a goal with obstacles too near stays the goal
+        last = np.array_equal(place, state.goal_pos) or np.array_equal(place, routes.towards(goal, goal)[0])
+        return state if last else state.but(goal_pos=place)
 
     def _kept_first(self, flocks: SubFlocks) -> SubFlocks:
         """The sub-flocks with the one last at work first, unless another is now much sooner done.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import re
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -30,6 +31,9 @@ WANTED = {
 }
 """What a flag takes, for the error that says so."""
 
+ADDRESS = re.compile(r"([a-z]+://)?[^\s/]+:\d+")
+"""Of a scheduler."""
+
 T = TypeVar("T")
 
 
@@ -53,7 +57,7 @@ def parsed(cls: type[T], prog: str, argv: Sequence[str]) -> tuple[T, set[str]]:
         argv: its words.
 
     Raises:
-        SettingsError: the words are no such options, in one line; or --workers and --scheduler were both given.
+        SettingsError: the words are no such options; --scheduler is no address, or is given with --workers. One line.
         SystemExit: after ``--help``.
     """
     said = io.StringIO()
@@ -68,6 +72,9 @@ def parsed(cls: type[T], prog: str, argv: Sequence[str]) -> tuple[T, set[str]]:
         raise SettingsError(f"{problem}{''.join(wanted[:1])} (see {prog} --help)") from None
     names = [f.name for f in fields(cls)]  # type: ignore[arg-type]
     given = {name for name in names if any(word.split("=")[0] == f"--{name}" for word in argv)}
+    scheduler = getattr(options, "scheduler", None)
+    if scheduler is not None and not ADDRESS.fullmatch(scheduler):
+        raise SettingsError(f"scheduler: {scheduler!r} is no address; it must be like tcp://HOST:PORT")
     if {"workers", "scheduler"} <= given:
         raise SettingsError("--workers and --scheduler: the workers are the cluster's then; leave one of the two out")
     return options, given

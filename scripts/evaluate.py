@@ -148,6 +148,8 @@ def ready(folder: Path, todo: Sequence[campaign.Task], sources: Sequence[Path] =
         CampaignError: the folder is not to be had, or nothing can be gathered from a source.
     """
     taken = campaign.gathered(sources, __version__, todo)
+    if sources:
+        print(f"gathered {len(taken)} of {len(todo)} episodes", file=sys.stderr)
     is_new = not (folder / campaign.LEDGER).exists()
     if is_new:
         rehearse([task for task in todo if task.key not in taken])

@@ -35,7 +35,8 @@ def figure_page(name: str, summary: Sequence[Mapping[str, Any]]) -> str:
         "",
         f"![{experiment.title}; sheep delivered and path length]({name}.png)",
         "",
-        f"{', '.join(same)}; mean [95 % bootstrap interval]; made by `shepherd-phys reproduce {name}`.",
+        f"{', '.join(same)}; mean [95 % bootstrap interval]; made by `shepherd-phys reproduce`; "
+        "claims.json has seed and version.",
     ]
     for metric, (title, digits) in MEASURES.items():
         head = ["controller", *(SHOWN[experiment.varied].format(column) for column in columns)]

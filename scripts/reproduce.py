@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import importlib
 import json
-import os
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ from rich.console import Console
 from rich.table import Table
 
 from shepherd_phys import __version__, campaign
-from shepherd_phys.campaign import CampaignError, Ledger, Outcome, Task, write_csv
+from shepherd_phys.campaign import CampaignError, Ledger, Outcome, Task, remove, write_bytes, write_csv
 from shepherd_phys.controllers import CONTROLLERS
 from shepherd_phys.controllers.claims import EXPERIMENTS, HEURISTICS, LEARNED, LITERAL, judge
 from shepherd_phys.controllers.evaluation import COLUMNS, ControllerError, trial_seed
@@ -164,7 +163,11 @@ def kept(ledger: Ledger, tasks: Sequence[Task]) -> Outcome:
 def summary_of(name: str, rows: Sequence[Mapping[str, Any]], methods: Sequence[str]) -> list[dict[str, Any]]:
     """The rows of an experiment's CSV: method by method."""
     there = EXPERIMENTS[name].points
-    summary = summarise(row for row in rows if (row["n_flocks"], row["cohesion"]) in there)
+    hashes = {(row["controller"], row["n_flocks"], row["cohesion"]): row["settings_hash"] for row in rows}
+    summary = [
+        {**row, "settings_hash": hashes[row["controller"], row["n_flocks"], row["cohesion"]]}
+        for row in summarise(row for row in rows if (row["n_flocks"], row["cohesion"]) in there)
+    ]
     return sorted(summary, key=lambda row: (methods.index(row["controller"]), row["n_flocks"], row["cohesion"]))
 
 
@@ -197,39 +200,18 @@ def write_files(
     write_csv(episodes, COLUMNS, rows)
     paths = [episodes]
     for name, summary in summaries.items():
-        if not summary:
-            continue  # every episode failed, which is reported
-        paths.append(folder / f"{name}.csv")
-        write_csv(paths[-1], summary_columns(), summary)
-        paths.append(write_whole(folder / f"{name}.md", figure_page(name, summary).encode()))
-        paths.append(write_whole(folder / f"{name}.png", draw(EXPERIMENTS[name], summary)))
+        own = [folder / f"{name}.{kind}" for kind in ("csv", "md", "png")]
+        if not summary:  # every episode failed, which is reported; what an earlier run drew must not stand for it
+            remove(own)
+            continue
+        write_csv(own[0], (*summary_columns(), "settings_hash"), summary)
+        write_bytes(own[1], figure_page(name, summary).encode())
+        write_bytes(own[2], draw(EXPERIMENTS[name], summary))
+        paths += own
     text = json.dumps(claims, allow_nan=False, indent=1, ensure_ascii=False)
-    paths.append(write_whole(folder / "claims.json", f"{text}\n".encode()))
-    paths.append(write_whole(folder / "claims.md", claims_page(claims).encode()))
-    return paths
-
-
-def write_whole(path: Path, content: bytes) -> Path:
-    """Write a file, which appears whole or not at all; its path.
-
-    Raises:
-        CampaignError: it cannot be written.
-    """
-    part = path.with_name(path.name + ".part")
-    try:
-        with part.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(part, path)
-    except OSError as error:
-        raise CampaignError(
-            f"{path}: cannot be written ({error.strerror}); no episode is lost: the same run writes it again"
-        ) from None
-    finally:
-        with contextlib.suppress(OSError):
-            part.unlink()
-    return path
+    write_bytes(folder / "claims.json", f"{text}\n".encode())
+    write_bytes(folder / "claims.md", claims_page(claims).encode())
+    return [*paths, folder / "claims.json", folder / "claims.md"]
 
 
 def print_claims(claims: Mapping[str, Any], out: TextIO) -> None:

@@ -78,8 +78,8 @@ class Cluster:
     """The workers of a Dask cluster doing ``work``, those that join later too. A context manager.
 
     A job whose worker dies has failed. A job that takes too long has failed too: its worker is restarted, where a nanny
-    watches it, or left alone; what else it was doing is given to another and has lost nothing. The scheduler is told
-    nothing that concerns other users of it.
+    watches it, or ended; what else it was doing of ours is given to another and has lost nothing. (Other users' jobs on
+    that worker are restarted with it.) Otherwise the scheduler is told nothing that concerns others.
 
     Args:
         work: the function; workers import it.

@@ -107,7 +107,7 @@ def test_all_writes_both_figures_and_the_claims(folder, capsys):
     assert {row["seed"] for row in rows} == {str(trial_seed(20_000, i)) for i in (0, 1)}
     for name, experiment in EXPERIMENTS.items():
         table = read(f"o/{name}.csv")
-        assert tuple(table[0]) == summary_columns()
+        assert tuple(table[0]) == (*summary_columns(), "settings_hash")
         found = [(row["controller"], (int(row["n_flocks"]), int(row["cohesion"]))) for row in table]
         assert found == [(method, at) for method in ("strombom", "idle") for at in experiment.points]
         assert {row["trials"] for row in table} == {"2"}
@@ -186,11 +186,13 @@ def test_a_killed_run_continues_and_ends_the_same(folder):
     with subprocess.Popen(
         [*command, "1"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
     ) as killed:
-        for _ in range(2400):
-            log = Path("o/ledger.sqlite-wal")
+        log = Path("o/ledger.sqlite-wal")
+        for _ in range(12_000):  # where kernels are compiled first, it takes minutes to begin
             if log.exists() and log.stat().st_size > 30_000:
                 break
             time.sleep(0.02)
+        else:
+            raise AssertionError("it has not begun")
         os.killpg(killed.pid, signal.SIGKILL)
     assert killed.returncode == -signal.SIGKILL
     assert contents() == {}
@@ -292,7 +294,7 @@ def test_a_full_disk_leaves_what_was_there(folder, capsys, monkeypatch):
     first = contents()
     capsys.readouterr()
     monkeypatch.setattr(reproduce, "write_csv", lambda *args: None)  # the pages are what does not fit
-    monkeypatch.setattr(reproduce.os, "fsync", full)
+    monkeypatch.setattr("shepherd_phys.files.os.fsync", full)
     assert run("figure2", "--controllers", "idle", "--seed", "20001") == 1
     said = capsys.readouterr()
     assert said.out == ""
