@@ -235,7 +235,8 @@ class _Watch(BaseCallback):
 
     def __init__(self) -> None:
         super().__init__()
-        self._episodes: list[dict[str, Any]] = []
+        self._ended: list[dict[str, Any]] = []
+        self._episodes = 0
 
     def _on_step(self) -> bool:
         seen = self.locals
@@ -245,13 +246,15 @@ class _Watch(BaseCallback):
             finite = torch.isfinite(array).all() if isinstance(array, torch.Tensor) else np.isfinite(array).all()
             if not finite:
                 raise TrainingError(f"{name}: holds a NaN or an infinity: training stops")
-        self._episodes += [info for info in seen["infos"] if "episode" in info]
+        ended = [info for info in seen["infos"] if "episode" in info]
+        self._ended += ended
+        self._episodes += len({info["world"] for info in ended})
         return True
 
     def measures(self) -> dict[str, float]:
-        """Means over slots of whole episodes."""
-        found: dict[str, float] = {"episodes": len({id(info) for info in self._episodes})}
+        """Whole episodes that ended, and means over their shepherds."""
+        found: dict[str, float] = {"episodes": self._episodes}
         for name, key in EPISODE.items():
-            values = [float(info[key]) for info in self._episodes]
+            values = [float(info[key]) for info in self._ended]
             found[name] = float(np.mean(values)) if values else float("nan")
         return found
