@@ -16,9 +16,9 @@ from test_learning import TINY
 from shepherd_phys.controllers import load_policy
 from shepherd_phys.learning import checkpoints
 from shepherd_phys.learning.checkpoints import Checkpoint, CheckpointError
-from shepherd_phys.learning.folder import CURVE_COLUMNS, Table, begin
+from shepherd_phys.learning.folder import CURVE_COLUMNS, Table, alone, begin
 from shepherd_phys.learning.preset import load_preset
-from shepherd_phys.learning.run import best_policy, train
+from shepherd_phys.learning.run import train
 from shepherd_phys.settings import SettingsError
 
 # 3 slots x 8 decisions x 5 control steps = 120 a rollout, a few fewer where an episode is cut short; 2 rollouts a
@@ -108,7 +108,7 @@ def test_another_seed_is_another_run(unbroken, tmp_path):
 def test_what_a_run_leaves(unbroken):
     names = {path.name for path in unbroken.iterdir()}
     assert names == {
-        "preset.toml", "curve.csv", "validation.csv", "checkpoints", "tensorboard",
+        "preset.toml", "run.lock", "curve.csv", "validation.csv", "checkpoints", "tensorboard",
         "policy.json", "policy.safetensors", "best.json", "best.safetensors",
     }  # fmt: skip
     assert load_preset(unbroken / "preset.toml") == PRESET
@@ -122,7 +122,9 @@ def test_what_a_run_leaves(unbroken):
     assert any(rewards) and all(text == "" or np.isfinite(float(text)) for text in rewards)
     checked = rows_of(unbroken / "validation.csv")
     assert [row["checkpoint"] for row in checked] == ["1", "2", "3"]
-    assert best_policy(unbroken).spec.training["shepherd_steps"] in [int(row["shepherd_steps"]) for row in checked]
+    assert load_policy(unbroken / "best.json").spec.training["shepherd_steps"] in [
+        int(row["shepherd_steps"]) for row in checked
+    ]
     assert load_policy(unbroken / "policy.json").spec.training["shepherd_steps"] == steps[-1]
 
 
@@ -131,6 +133,11 @@ def test_a_finished_run_is_not_trained_further(unbroken, tmp_path):
     train(unbroken)
     after = checkpoints.load_latest(unbroken / "checkpoints")
     assert after.facts == before.facts
+
+
+def test_nobody_else_trains_in_the_folder(unbroken):
+    with alone(unbroken), pytest.raises(SettingsError, match="another process trains in it"):
+        train(unbroken)
 
 
 def test_a_folder_holds_one_run(unbroken):

@@ -56,7 +56,7 @@ def test_it_holds_one_package_and_all_of_it(wheel: Path) -> None:
     names = zipfile.ZipFile(wheel).namelist()
     assert {name.split("/")[0] for name in names if ".dist-info/" not in name} == {"shepherd_phys"}
     assert not [name for name in names if "tests" in name.split("/") or name.split("/")[-1].startswith("test_")]
-    assert "shepherd_phys/py.typed" in names
+    assert {"shepherd_phys/py.typed", "shepherd_phys/learning/presets/fast.toml"} <= set(names)
     assert [name for name in names if name.endswith(".dist-info/licenses/LICENSE")]
     sources = {
         f"{inside}/{path.relative_to(ROOT / folder).as_posix()}"

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Mapping, Sequence
+import sqlite3
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,7 @@ POLICY = "policy.json"
 BEST = "best.json"
 CHECKPOINTS = "checkpoints"
 TENSORBOARD = "tensorboard"
+LOCK = "run.lock"
 
 MEASURES = ("in_goal_end", "ever_in_goal", "mean_occupancy", "path_length", "time_to_95", "success")
 """What a validation measures, see `shepherd_phys.controllers.evaluation.run_episode`."""
@@ -45,6 +48,30 @@ def begin(folder: Path, preset: Preset) -> None:
     except OSError as error:
         raise SettingsError(f"{folder}: cannot be made ({error.strerror})") from None
     preset.to_toml(folder / PRESET)
+
+
+@contextmanager
+def alone(folder: Path) -> Iterator[None]:
+    """While nobody else trains in the folder.
+
+    The lock is an exclusive transaction on an empty SQLite file, which the system ends whatever ends the process.
+
+    Raises:
+        SettingsError: somebody does, or the folder cannot be written.
+    """
+    lock = None
+    try:
+        lock = sqlite3.connect(folder / LOCK, isolation_level=None, timeout=0.0)
+        lock.execute("BEGIN EXCLUSIVE")
+    except sqlite3.Error as error:
+        if lock is not None:
+            lock.close()
+        busy = getattr(error, "sqlite_errorname", "").startswith(("SQLITE_BUSY", "SQLITE_LOCKED"))
+        raise SettingsError(f"{folder}: {'another process trains in it' if busy else error}") from None
+    try:
+        yield
+    finally:
+        lock.close()
 
 
 class Table:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
 
-from shepherd_phys.controllers.learned import load_policy
+from shepherd_phys.controllers.learned import POLICIES, Policy, load_policy
 from shepherd_phys.envs.team import TeamVecEnv
 from shepherd_phys.learning.export import _actor, load_actor
 from shepherd_phys.learning.network import TeamPolicy
@@ -38,10 +39,15 @@ class Learner:
         preset: the run.
         n_workers: processes for the worlds; 0: this one. Results do not depend on it.
         logger: of stable-baselines3, for TensorBoard.
+        fresh: whether the run begins here; else `restore` is called next, and the preset's ``init`` is not needed.
+
+    Raises:
+        SettingsError: the policy that the preset names as ``init`` cannot be had, or does not fit.
     """
 
-    def __init__(self, preset: Preset, n_workers: int = 0, logger: Logger | None = None) -> None:
+    def __init__(self, preset: Preset, n_workers: int = 0, logger: Logger | None = None, fresh: bool = True) -> None:
         self.preset = preset
+        start = _start(preset) if fresh else None
         torch.set_num_threads(preset.threads)
         ppo = preset.ppo
         self.env = TeamVecEnv(
@@ -86,26 +92,15 @@ class Learner:
         self.rollouts = 0
         """Rollouts learned from since the run began."""
         self._steps_before = 0
-        if preset.init is not None:
-            self._begin_with(preset.init)
+        if start is not None:
+            load_actor(self.policy, start.weights)
+            with torch.no_grad():  # what it explored at its end is too little to learn anything new
+                self.policy.log_std.fill_(ppo.log_std_init)
 
     @property
     def shepherd_steps(self) -> int:
         """Control steps times shepherds since the run began."""
         return self._steps_before + self.env.shepherd_steps
-
-    def _begin_with(self, name: str) -> None:
-        """Take the actor from a policy."""
-        from shepherd_phys.controllers import POLICIES
-
-        policy = POLICIES[name]() if name in POLICIES else load_policy(name)
-        for part in ("lidar", "network"):
-            theirs, ours = getattr(policy.spec, part), getattr(self.preset, part)
-            if theirs != ours:
-                raise SettingsError(f"init: {name} has another {part} than the preset: {theirs}, not {ours}")
-        load_actor(self.policy, policy.weights)
-        with torch.no_grad():  # what it explored at its end is too little to learn anything new
-            self.policy.log_std.fill_(self.preset.ppo.log_std_init)
 
     def _seed_learner(self, number: int) -> None:
         """Seed the generators that torch and stable-baselines3 draw from."""
@@ -175,7 +170,7 @@ class Learner:
         }
         return arrays, facts
 
-    def restore(self, arrays: dict[str, Array], facts: dict[str, Any]) -> None:
+    def restore(self, arrays: Mapping[str, Array], facts: Mapping[str, Any]) -> None:
         """Take over a `state` of the same preset; `restart` comes next.
 
         Raises:
@@ -205,6 +200,23 @@ class Learner:
         self.env.close()
 
 
+def _start(preset: Preset) -> Policy | None:
+    """The policy to start from.
+
+    Raises:
+        SettingsError: it cannot be read, or is not of the preset's lidar and network.
+    """
+    name = preset.init
+    if name is None:
+        return None
+    policy = POLICIES[name]() if name in POLICIES else load_policy(name)
+    for part in ("lidar", "network"):
+        theirs, ours = getattr(policy.spec, part), getattr(preset, part)
+        if theirs != ours:
+            raise SettingsError(f"init: {name} has another {part} than the preset: {theirs}, not {ours}")
+    return policy
+
+
 LOGGED = (
     "train/value_loss",
     "train/policy_gradient_loss",
@@ -223,7 +235,8 @@ class _Watch(BaseCallback):
 
     def __init__(self) -> None:
         super().__init__()
-        self._episodes: list[dict[str, Any]] = []
+        self._ended: list[dict[str, Any]] = []
+        self._episodes = 0
 
     def _on_step(self) -> bool:
         seen = self.locals
@@ -233,13 +246,15 @@ class _Watch(BaseCallback):
             finite = torch.isfinite(array).all() if isinstance(array, torch.Tensor) else np.isfinite(array).all()
             if not finite:
                 raise TrainingError(f"{name}: holds a NaN or an infinity: training stops")
-        self._episodes += [info for info in seen["infos"] if "episode" in info]
+        ended = [info for info in seen["infos"] if "episode" in info]
+        self._ended += ended
+        self._episodes += len({info["world"] for info in ended})
         return True
 
     def measures(self) -> dict[str, float]:
-        """Means over slots of whole episodes."""
-        found: dict[str, float] = {"episodes": len({id(info) for info in self._episodes})}
+        """Whole episodes that ended, and means over their shepherds."""
+        found: dict[str, float] = {"episodes": self._episodes}
         for name, key in EPISODE.items():
-            values = [float(info[key]) for info in self._episodes]
+            values = [float(info[key]) for info in self._ended]
             found[name] = float(np.mean(values)) if values else float("nan")
         return found

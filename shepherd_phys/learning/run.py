@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.logger import configure
 
-from shepherd_phys.controllers.learned import Policy
 from shepherd_phys.controllers.policy_files import write_policy
 from shepherd_phys.learning import checkpoints
 from shepherd_phys.learning.checkpoints import Checkpoint
@@ -28,10 +27,11 @@ from shepherd_phys.learning.folder import (
     VALIDATION,
     VALIDATION_COLUMNS,
     Table,
+    alone,
 )
 from shepherd_phys.learning.ppo import Learner
 from shepherd_phys.learning.preset import Preset
-from shepherd_phys.learning.validation import validator
+from shepherd_phys.learning.validation import Validator, validator
 
 
 class Progress(NamedTuple):
@@ -72,67 +72,123 @@ def train(folder: Path, n_workers: int = 1, report: Callable[[Progress], None] =
         the best policy.
 
     Raises:
+        SettingsError: another process trains in the folder; or the policy to start from cannot be had.
         TrainingError: something is not finite.
         CheckpointError: a checkpoint cannot be written, or none of those there can be read.
     """
-    preset = Preset.from_toml(folder / PRESET)
-    logger = configure(str(folder / TENSORBOARD), ["tensorboard"])
-    learner = Learner(preset, n_workers if n_workers > 1 else 0, logger)
-    try:
-        with validator(preset, n_workers) as validate:
-            number, best, seconds = 0, None, 0.0
-            saved = checkpoints.load_latest(folder / CHECKPOINTS)
-            if saved is not None:
-                number, best, seconds = saved.number, _best_of(saved), float(saved.facts["seconds"])
-                learner.restore(dict(saved.arrays), dict(saved.facts))
-                _export(folder, learner, best)
-            curve = Table(folder / CURVE, CURVE_COLUMNS, learner.rollouts)
-            validations = Table(folder / VALIDATION, VALIDATION_COLUMNS, number)
-            clock = _Clock(seconds, learner.shepherd_steps)
-            while learner.shepherd_steps < preset.budget:
-                learner.restart(number)
-                for _ in range(preset.checkpoint_rollouts):
-                    measures = learner.learn()
-                    steps = learner.shepherd_steps
-                    measures |= {"in_goal_end": 100.0 * measures.pop("in_goal"), "seconds": clock.seconds()}
-                    decisions = learner.model.num_timesteps
-                    counts = {"rollout": learner.rollouts, "shepherd_steps": steps, "decisions": decisions}
-                    curve.add({**measures, **counts})
-                    for name in ("episode_reward", "in_goal_end", "path_length"):
-                        if math.isfinite(measures[name]):
-                            logger.record(f"episodes/{name}", measures[name])
-                    logger.record("time/shepherd_steps", steps)
-                    report(Progress(steps, preset.budget, clock.rate(steps), measures, ()))
-                    if steps >= preset.budget:
-                        break
-                number += 1
-                if number % preset.validation.every == 0 or steps >= preset.budget:
-                    policy = to_policy(learner.model, spec_of(preset, steps))
-                    rows = validate(policy)
-                    score = validate.score(rows)
-                    if best is None or score > best.score:
-                        best = Best(score, steps, policy.weights)
-                    for row in rows:
-                        validations.add({**row, "checkpoint": number, "shepherd_steps": steps})
-                        logger.record(f"validation/in_goal_end/{row['n_flocks']}_flocks", row["in_goal_end"])
-                    logger.record("validation/score", score)
-                    report(Progress(steps, preset.budget, clock.rate(steps), measures, rows))
-                checkpoints.save(folder / CHECKPOINTS, _checkpoint(number, learner, best, clock.seconds()))
-                _export(folder, learner, best)
-            logger.dump(learner.model.num_timesteps)
-            return best
-    finally:
-        learner.close()
-        logger.close()
+    with alone(folder):
+        preset = Preset.from_toml(folder / PRESET)
+        saved = checkpoints.load_latest(folder / CHECKPOINTS)
+        logger = configure(str(folder / TENSORBOARD), ["tensorboard"])
+        learner = Learner(preset, n_workers if n_workers > 1 else 0, logger, fresh=saved is None)
+        try:
+            with validator(preset, n_workers) as validate:
+                run = _Run(folder, learner, validate, report, saved)
+                while not run.over:
+                    run.interval()
+                    if run.over or run.number % preset.validation.every == 0:
+                        run.judge()
+                    run.save()
+                logger.dump(learner.model.num_timesteps)
+                return run.best
+        finally:
+            learner.close()
+            logger.close()
 
 
-def _checkpoint(number: int, learner: Learner, best: Best | None, seconds: float) -> Checkpoint:
-    arrays, facts = learner.state()
-    facts["seconds"] = seconds
-    if best is not None:
-        arrays |= {f"best/{name}": array for name, array in best.weights.items()}
-        facts["best"] = {"score": best.score, "shepherd_steps": best.shepherd_steps}
-    return Checkpoint(number, arrays, facts)
+class _Run:
+    """A run between two checkpoints: what `train` does, in three steps."""
+
+    def __init__(
+        self,
+        folder: Path,
+        learner: Learner,
+        validate: Validator,
+        report: Callable[[Progress], None],
+        saved: Checkpoint | None,
+    ) -> None:
+        self._folder, self._learner, self._validate, self._report = folder, learner, validate, report
+        self.number = 0
+        self.best: Best | None = None
+        seconds = 0.0
+        if saved is not None:
+            learner.restore(saved.arrays, saved.facts)
+            self.number, self.best, seconds = saved.number, _best_of(saved), float(saved.facts["seconds"])
+            self._export()  # the kill may have come between the two files of a policy
+        self._curve = Table(folder / CURVE, CURVE_COLUMNS, learner.rollouts)
+        self._validations = Table(folder / VALIDATION, VALIDATION_COLUMNS, self.number)
+        self._clock = _Clock(seconds, learner.shepherd_steps)
+        self._measures: dict[str, float] = {}
+
+    @property
+    def over(self) -> bool:
+        """Whether the budget is spent."""
+        return self._learner.shepherd_steps >= self._learner.preset.budget
+
+    def interval(self) -> None:
+        """Begin anew in all worlds and learn from as many rollouts as lie between two checkpoints."""
+        learner, logger = self._learner, self._learner.model.logger
+        learner.restart(self.number)
+        for _ in range(learner.preset.checkpoint_rollouts):
+            measures = learner.learn()
+            measures["in_goal_end"] = 100.0 * measures.pop("in_goal")
+            self._measures = measures
+            self._curve.add(
+                {
+                    **measures,
+                    "rollout": learner.rollouts,
+                    "shepherd_steps": learner.shepherd_steps,
+                    "decisions": learner.model.num_timesteps,
+                    "seconds": self._clock.seconds(),
+                }
+            )
+            for name in ("episode_reward", "in_goal_end", "path_length"):
+                if math.isfinite(measures[name]):
+                    logger.record(f"episodes/{name}", measures[name])
+            logger.record("time/shepherd_steps", learner.shepherd_steps)
+            self._tell(())
+            if self.over:
+                break
+        self.number += 1
+
+    def judge(self) -> None:
+        """Validate the policy; keep it if it is the best so far."""
+        learner, logger = self._learner, self._learner.model.logger
+        steps = learner.shepherd_steps
+        policy = to_policy(learner.model, spec_of(learner.preset, steps))
+        rows = self._validate(policy)
+        score = self._validate.score(rows)
+        if self.best is None or score > self.best.score:
+            self.best = Best(score, steps, policy.weights)
+        for row in rows:
+            self._validations.add({**row, "checkpoint": self.number, "shepherd_steps": steps})
+            point = f"{row['n_flocks']}_flocks_n_{row['cohesion']}_{row['n_shepherds']}_shepherds"
+            logger.record(f"validation/in_goal_end_{point}", row["in_goal_end"])
+        logger.record("validation/score", score)
+        self._tell(rows)
+
+    def save(self) -> None:
+        """Write the checkpoint and the policies."""
+        arrays, facts = self._learner.state()
+        facts["seconds"] = self._clock.seconds()
+        if self.best is not None:
+            arrays |= {f"best/{name}": array for name, array in self.best.weights.items()}
+            facts["best"] = {"score": self.best.score, "shepherd_steps": self.best.shepherd_steps}
+        checkpoints.save(self._folder / CHECKPOINTS, Checkpoint(self.number, arrays, facts))
+        self._export()
+
+    def _export(self) -> None:
+        """Write the latest policy and the best one."""
+        learner = self._learner
+        to_policy(learner.model, spec_of(learner.preset, learner.shepherd_steps), self._folder / POLICY)
+        if self.best is not None:
+            spec = spec_of(learner.preset, self.best.shepherd_steps)
+            write_policy(self._folder / BEST, spec, self.best.weights)
+
+    def _tell(self, validation: Sequence[Mapping[str, Any]]) -> None:
+        steps = self._learner.shepherd_steps
+        rate = self._clock.rate(steps)
+        self._report(Progress(steps, self._learner.preset.budget, rate, self._measures, validation))
 
 
 def _best_of(saved: Checkpoint) -> Best | None:
@@ -140,19 +196,6 @@ def _best_of(saved: Checkpoint) -> Best | None:
         return None
     weights = {name.removeprefix("best/"): a for name, a in saved.arrays.items() if name.startswith("best/")}
     return Best(float(saved.facts["best"]["score"]), int(saved.facts["best"]["shepherd_steps"]), weights)
-
-
-def _export(folder: Path, learner: Learner, best: Best | None) -> None:
-    """Write the latest policy and the best one."""
-    preset = learner.preset
-    to_policy(learner.model, spec_of(preset, learner.shepherd_steps), folder / POLICY)
-    if best is not None:
-        write_policy(folder / BEST, spec_of(preset, best.shepherd_steps), best.weights)
-
-
-def best_policy(folder: Path) -> Policy:
-    """The best policy of a run."""
-    return Policy.load(folder / BEST)
 
 
 class _Clock:
