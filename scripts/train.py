@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
-import io
 import math
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,7 +20,7 @@ from shepherd_phys.learning.folder import BEST, CURVE, POLICY, PRESET, VALIDATIO
 from shepherd_phys.learning.preset import Preset, load_preset
 from shepherd_phys.settings import SettingsError
 
-from .evaluate import LOG_SECONDS, _clock, _flag, _one_line, cpu_count
+from .command import LOG_SECONDS, at_least, clock, cpu_count, fail, flag, parsed
 
 PROG = "shepherd-phys train"
 LIBRARIES = ("torch", "stable_baselines3", "tensorboard")
@@ -36,19 +35,19 @@ class Train:
     A run that was stopped or killed goes on with --resume, exactly as if nothing had happened.
     """
 
-    preset: Annotated[str, _flag("NAME|FILE")] = "fast"
+    preset: Annotated[str, flag("NAME|FILE")] = "fast"
     """How to train: fast, paper or collie, or a TOML file of your own."""
-    reward: Annotated[str | None, _flag("NAME", "the preset's")] = None
+    reward: Annotated[str | None, flag("NAME", "the preset's")] = None
     """Reward scheme."""
-    seed: Annotated[int | None, _flag("S", "the preset's")] = None
+    seed: Annotated[int | None, flag("S", "the preset's")] = None
     """Root of everything random; 1,000,000 and up is meant for training."""
-    budget: Annotated[int | None, _flag("N", "the preset's")] = None
+    budget: Annotated[int | None, flag("N", "the preset's")] = None
     """Shepherd-steps (control steps times shepherds) to train for."""
-    init: Annotated[str | None, _flag("NAME|FILE", "the preset's")] = None
+    init: Annotated[str | None, flag("NAME|FILE", "the preset's")] = None
     """Policy to start from: a shipped one's name or a .json file."""
-    workers: Annotated[int, _flag("W")] = cpu_count()
+    workers: Annotated[int, flag("W")] = cpu_count()
     """Processes for the worlds; the results do not depend on it."""
-    out: Annotated[Path | None, _flag("DIR", "runs/PRESET-REWARD-SEED")] = None
+    out: Annotated[Path | None, flag("DIR", "runs/PRESET-REWARD-SEED")] = None
     """Folder of the run."""
     resume: tyro.conf.FlagCreatePairsOff[bool] = False
     """Go on with the run in --out."""
@@ -67,7 +66,7 @@ def main(argv: Sequence[str]) -> int:
             raise SettingsError(f"{', '.join(missing)} is missing: pip install 'shepherd-phys[train]'")
         folder, preset = prepare(options, flags)
     except SettingsError as error:
-        return _fail(error, 2)
+        return fail(PROG, error, 2)
     # imported only now: torch takes seconds to load, which no mistake in the flags should cost
     from shepherd_phys.envs.team import WorkerError
     from shepherd_phys.learning.checkpoints import CheckpointError
@@ -84,11 +83,11 @@ def main(argv: Sequence[str]) -> int:
         try:
             best = train(folder, options.workers, report)
         except SettingsError as error:
-            return _fail(error, 2)
+            return fail(PROG, error, 2)
         except (CheckpointError, TrainingError, ValidationError, WorkerError, WorkersError, OSError) as error:
-            return _fail(error, 1)
+            return fail(PROG, error, 1)
         except KeyboardInterrupt:
-            return _fail(f"stopped: --resume --out {folder} goes on from the last checkpoint", 130)
+            return fail(PROG, f"stopped: --resume --out {folder} goes on from the last checkpoint", 130)
     if best is not None:
         print(f"best policy: score {best.score:.1f} after {best.shepherd_steps:,} shepherd-steps")
     for name in (BEST, POLICY, CURVE, VALIDATION):
@@ -104,19 +103,8 @@ def read_options(argv: Sequence[str]) -> tuple[Train, set[str]]:
         SettingsError: something is unknown or impossible.
         SystemExit: after ``--help``.
     """
-    said = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(said):
-            options = tyro.cli(Train, prog=PROG, args=list(argv))
-    except SystemExit as end:
-        if not end.code:
-            raise
-        raise SettingsError(f"{_one_line(said.getvalue())} (see {PROG} --help)") from None
-    for name, least in {"seed": 0, "budget": 1, "workers": 1}.items():
-        value = getattr(options, name)
-        if value is not None and value < least:
-            raise SettingsError(f"{name}: {value} is impossible; it must be at least {least}")
-    given = {f.name for f in fields(Train) if any(a == f"--{f.name}" or a.startswith(f"--{f.name}=") for a in argv)}
+    options, given = parsed(Train, PROG, argv)
+    at_least(vars(options), {"seed": 0, "budget": 1, "workers": 1})
     return options, given
 
 
@@ -170,7 +158,7 @@ def progress_bar() -> Iterator[Any]:
             )
             console.print(f"validation at {steps}: {points}", soft_wrap=True)
             return
-        left = _clock(max(0, now.budget - now.shepherd_steps) / max(now.rate, 1e-9))
+        left = clock(max(0, now.budget - now.shepherd_steps) / max(now.rate, 1e-9))
         told = f"{now.rate:,.0f} shepherd-steps/s, {left} left"
         if math.isfinite(now.measures["episode_reward"]):
             told += f", reward {now.measures['episode_reward']:.2f}, {now.measures['in_goal_end']:.0f} % in"
@@ -181,8 +169,3 @@ def progress_bar() -> Iterator[Any]:
 
     with bar:
         yield report
-
-
-def _fail(error: object, status: int) -> int:
-    print(f"{PROG}: {' '.join(str(error).split())}", file=sys.stderr)
-    return status
