@@ -654,7 +654,7 @@ def test_front_door(capsys):
         assert main.main(argv) == 2
         said = capsys.readouterr()
         assert said.out == ""
-        assert said.err.startswith(f"shepherd-phys: {problem}; commands are evaluate, benchmark")
+        assert said.err.startswith(f"shepherd-phys: {problem}; commands are evaluate, train, benchmark")
 
 
 def test_commands_exist():
