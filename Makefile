@@ -9,7 +9,7 @@ WORKERS ?= 2
 unexport PYTHONPATH PYTHONHOME PYTHONSTARTUP VIRTUAL_ENV PIP_USER PIP_TARGET PIP_PREFIX
 
 .DELETE_ON_ERROR:
-.PHONY: help run test test-slow lint format benchmark lock clean clean-kernels .venv FORCE
+.PHONY: help run test test-slow lint format benchmark reproduce lock clean clean-kernels .venv FORCE
 
 help:  ## this list
 	@sed -n 's/^\([a-z.-]*\):[^#]*##  *\(.*\)/\1|\2/p' $(MAKEFILE_LIST) | while IFS='|' read -r name text; do printf '  make %-10s %s\n' "$$name" "$$text"; done
@@ -34,6 +34,12 @@ format: build/.installed  ## repair what ruff can repair
 
 benchmark: build/.installed  ## measure the speed of the simulator
 	$(BIN)/shepherd-phys benchmark
+
+reproduce: build/.installed  ## run the paper's experiments (hours; continues) and put the results into docs/reproduction/
+	$(BIN)/shepherd-phys reproduce all --literal --workers $(WORKERS) --out results/reproduce
+	mkdir -p docs/reproduction
+	for name in figure2 figure3; do for kind in csv md png; do cp results/reproduce/$$name.$$kind docs/reproduction/ || exit 1; done; done
+	cp results/reproduce/claims.json results/reproduce/claims.md docs/reproduction/
 
 .venv: build/.installed  ## the whole development environment
 
@@ -65,7 +71,7 @@ lock: build/.installed  ## write requirements.lock anew, keeping the versions it
 	sed -i.old -e 's/+cpu$$//' -e '/^pip==/d' requirements.lock && rm requirements.lock.old
 
 clean-kernels:  ## forget numba's compiled kernels
-	find shepherd_phys envs build -name '*.nb[ic]' -exec rm -f {} +
+	find shepherd_phys envs controllers build -name '*.nb[ic]' -exec rm -f {} +
 
 clean:  ## remove everything that was made, results and runs excepted
 	rm -rf .venv build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .benchmarks

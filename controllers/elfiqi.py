@@ -34,7 +34,7 @@ from pydantic import Field
 from shepherd_phys.settings import Settings, settings
 from shepherd_phys.state import Floats, WorldState, centroid, unit
 
-from .formation import Surroundings, Team, TeamSettings, bearing_of, heading, in_order, limited, wrapped
+from .formation import SubFlocks, Surroundings, Team, TeamSettings, bearing_of, heading, in_order, limited, wrapped
 
 MU = 2.0
 """mu, how fast repulsion fades."""
@@ -60,20 +60,37 @@ class ElfiqiSettings(TeamSettings):
     """R1 + R2 behind the centroid."""
 
 
+TUNED = ElfiqiSettings(
+    stop_distance=2.5,
+    link=2.5,
+    let_go=3.5,
+    ring=10.5,
+    ring_out=12.0,
+    crumb=0.7,
+    loyalty=4.0,
+    berth=9.5,
+    flock_radius=5.0,
+    collect_standoff=4.0,
+    drive_distance=9.0,
+)
+"""What the team plays with. Found by ``shepherd-phys tune --controller elfiqi --rounds 4 --candidates 8 --seed 0``,
+version 0.1.0; the record is docs/tuning/elfiqi.toml."""
+
+
 class Elfiqi(Team):
     """The tuned team: one sub-flock at a time, a terminal rule.
 
     Args:
-        settings: its lengths.
+        settings: its lengths; `TUNED` unless given.
     """
 
     def __init__(self, settings: ElfiqiSettings | None = None) -> None:
-        self.settings = settings or ElfiqiSettings()
+        self.settings = settings or TUNED
         super().__init__(self.settings)
 
-    def _targets(self, state: WorldState, flocks: list[Floats]) -> Floats:
-        s, flock, m = self.settings, flocks[0], state.n_shepherds
-        gcm = centroid(flock)
+    def _targets(self, state: WorldState, flocks: SubFlocks) -> Floats:
+        s, flock, m = self.settings, flocks.sheep[0], state.n_shepherds
+        gcm = flocks.centers[0]
         stray = nearest_strays(state.shepherd_pos, flock, s.flock_radius)
         targets = collecting_places(flock, stray, s.collect_standoff)
         drivers = np.flatnonzero(stray < 0)

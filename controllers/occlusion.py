@@ -15,14 +15,16 @@ R_c is never taken as less than `min_radius`: one sheep hides nothing. The team 
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from shepherd_phys.settings import settings
-from shepherd_phys.state import Floats, WorldState, centroid, unit
+from shepherd_phys.state import Floats, WorldState, unit
 
-from .formation import WEDGE, Team, TeamSettings, bearing_of, heading, wrapped
+from .formation import WEDGE, SubFlocks, Team, TeamSettings, bearing_of, heading, wrapped
 
 
 @settings
@@ -37,28 +39,48 @@ class OcclusionSettings(TeamSettings):
     """Least R_c."""
 
 
+TUNED = OcclusionSettings(
+    stop_distance=2.0,
+    link=2.0,
+    let_go=4.0,
+    ring=10.5,
+    ring_out=12.0,
+    crumb=0.7,
+    loyalty=2.0,
+    berth=9.0,
+    approach=4.0,
+    circle=8.0,
+    min_radius=0.5,
+)
+"""What the team plays with. Found by ``shepherd-phys tune --controller occlusion --rounds 4 --candidates 8 --seed 0``,
+version 0.1.0; the record is docs/tuning/occlusion.toml."""
+
+
 class Occlusion(Team):
     """The team: a sub-flock for each shepherd, a terminal rule.
 
     Args:
-        settings: its lengths.
+        settings: its lengths; `TUNED` unless given.
     """
 
     def __init__(self, settings: OcclusionSettings | None = None) -> None:
-        self.settings = settings or OcclusionSettings()
+        self.settings = settings or TUNED
         super().__init__(self.settings)
 
-    def _targets(self, state: WorldState, flocks: list[Floats]) -> Floats:
+    def _targets(self, state: WorldState, flocks: SubFlocks) -> Floats:
         s = self.settings
-        centers = np.array([centroid(flock) for flock in flocks])
-        radii = [max(float(np.hypot(*(f - c).T).max()), s.min_radius) for f, c in zip(flocks, centers, strict=True)]
-        chosen = shared_out(state.shepherd_pos, centers, np.array([len(flock) for flock in flocks]))
-        own, pos = centers[chosen], state.shepherd_pos
+        centers, pos = flocks.centers, state.shepherd_pos
+        chosen = shared_out(pos, centers, np.array([len(flock) for flock in flocks.sheep]))
+        own = centers[chosen]
         facing = unit(pos - own)
-        extents = np.array([((flocks[f] - centers[f]) @ facing[k]).max() for k, f in enumerate(chosen)])
-        return occlusion_targets(pos, state.goal_pos, own, np.array(radii)[chosen], extents + s.approach, s.circle)
+        radii, extents = np.empty(len(pos)), np.empty(len(pos))
+        for k, f in enumerate(chosen.tolist()):
+            spread = flocks.sheep[f] - centers[f]
+            radii[k] = max(math.sqrt((spread * spread).sum(axis=1).max()), s.min_radius)
+            extents[k] = (spread @ facing[k]).max()
+        return occlusion_targets(pos, state.goal_pos, own, radii, extents + s.approach, s.circle)
 
-    def _way(self, state: WorldState, targets: Floats, flocks: list[Floats]) -> Floats:
+    def _way(self, state: WorldState, targets: Floats, flocks: SubFlocks) -> Floats:
         return targets  # circling is part of the method
 
 

@@ -25,13 +25,14 @@ import math
 from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
 from shepherd_phys.settings import Settings, settings
 from shepherd_phys.state import Floats, WorldState, centroid
 
-from .formation import Team, TeamSettings, bearing_of, heading, in_order, limited
+from .formation import SubFlocks, Team, TeamSettings, bearing_of, heading, in_order, limited
 
 HALVINGS = 50
 """Steps of the search for the arc's width."""
@@ -55,22 +56,26 @@ class PiersonSettings(TeamSettings):
     """Largest r: shepherds are felt no further than 10 m."""
 
 
+TUNED = PiersonSettings()
+"""What the team plays with. ``shepherd-phys tune --controller pierson --rounds 4 --candidates 8 --seed 0``, version
+0.1.0, found nothing better than what was set by hand; the record is docs/tuning/pierson.toml."""
+
+
 class Pierson(Team):
     """The tuned team: the arc behind one sub-flock at a time, a terminal rule.
 
     Shepherds take the places of the arc in the order in which they stand round the flock, so that none crosses it.
 
     Args:
-        settings: its lengths and gains.
+        settings: its lengths and gains; `TUNED` unless given.
     """
 
     def __init__(self, settings: PiersonSettings | None = None) -> None:
-        self.settings = settings or PiersonSettings()
+        self.settings = settings or TUNED
         super().__init__(self.settings)
 
-    def _targets(self, state: WorldState, flocks: list[Floats]) -> Floats:
-        s, flock = self.settings, flocks[0]
-        gcm = centroid(flock)
+    def _targets(self, state: WorldState, flocks: SubFlocks) -> Floats:
+        s, flock, gcm = self.settings, flocks.sheep[0], flocks.centers[0]
         to_goal = state.goal_pos - gcm
         push = min(max(s.gain * math.hypot(*to_goal), s.min_push), 1.0)
         arc = max(arc_width(push, state.n_shepherds), s.min_arc)
@@ -128,7 +133,8 @@ class PiersonReconstructed:
         return limited(s.tracking * (places - state.shepherd_pos) / state.shepherd_max_speed[:, None])
 
 
-def arc_width(push: float, n_shepherds: int) -> float:
+@njit(cache=True)
+def arc_width(push, n_shepherds):  # type: ignore[no-untyped-def]
     """Delta in [0, Delta_0] for which sum_j cos Delta_j = m v_hat, by bisection; 0 for a lone shepherd [rad].
 
     Args:

@@ -17,24 +17,23 @@ answer to: one sub-flock at a time and a terminal rule (`shepherd_phys.controlle
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
 from shepherd_phys.settings import settings
-from shepherd_phys.state import Floats, WorldState, centroid, unit
+from shepherd_phys.state import Floats, WorldState
 
-from .formation import Team, TeamSettings, walk
+from .formation import SubFlocks, Team, TeamSettings, walk
 
 
 @settings
 class StrombomSettings(TeamSettings):
-    """Lengths in metres, angles in radians; symbols of the 2014 paper.
-
-    The defaults were tuned by hand on a few episodes of the tuning seeds (three shepherds, one and two flocks).
-    """
+    """Lengths in metres, angles in radians; symbols of the 2014 paper."""
 
     collect_standoff: float = Field(default=4.0, gt=0)
     """Behind an outlier; r_a in the paper."""
@@ -46,20 +45,38 @@ class StrombomSettings(TeamSettings):
     """Between neighbouring shepherds of the V (Fujioka 2018)."""
 
 
+TUNED = StrombomSettings(
+    stop_distance=1.54,
+    link=4.7,
+    let_go=4.22,
+    ring=10.56,
+    ring_out=12.04,
+    crumb=0.63,
+    loyalty=4.18,
+    berth=8.33,
+    collect_standoff=2.99,
+    drive_standoff=8.69,
+    flock_radius=5.3,
+    v_angle=0.46,
+)
+"""What the team plays with. Found by ``shepherd-phys tune --controller strombom --rounds 4 --candidates 8 --seed 0``,
+version 0.1.0; the record is docs/tuning/strombom.toml."""
+
+
 class StrombomTeam(Team):
     """The tuned team: sub-flock by sub-flock, own stand-offs, a terminal rule.
 
     Args:
-        settings: its lengths.
+        settings: its lengths; `TUNED` unless given.
     """
 
     def __init__(self, settings: StrombomSettings | None = None) -> None:
-        self.settings = settings or StrombomSettings()
+        self.settings = settings or TUNED
         super().__init__(self.settings)
 
-    def _targets(self, state: WorldState, flocks: list[Floats]) -> Floats:
+    def _targets(self, state: WorldState, flocks: SubFlocks) -> Floats:
         s = self.settings
-        return team_targets(state, flocks[0], s.flock_radius, s.collect_standoff, s.drive_standoff, s.v_angle)
+        return team_targets(state, flocks.sheep[0], s.flock_radius, s.collect_standoff, s.drive_standoff, s.v_angle)
 
 
 class StrombomLiteral:
@@ -109,17 +126,31 @@ def team_targets(
     Returns:
         (P, 2) positions [m].
     """
-    p = state.n_shepherds
-    gcm = centroid(flock)
-    spread = flock - gcm
-    far = np.hypot(spread[:, 0], spread[:, 1])
-    behind = unit(gcm - state.goal_pos)
-    if not behind.any():  # the centroid on the goal's centre: any side will do
-        behind = np.array([1.0, 0.0])
-    theta = (np.arange(p) - (p - 1) / 2) * v_angle
-    cos, sin = np.cos(theta), np.sin(theta)
-    targets = gcm + drive * np.stack([cos * behind[0] - sin * behind[1], sin * behind[0] + cos * behind[1]], axis=1)
-    furthest = np.argsort(-far, kind="stable")[:p]
-    outliers = furthest[far[furthest] > flock_radius]
-    targets[: len(outliers)] = flock[outliers] + collect * unit(spread[outliers])
-    return np.asarray(targets)
+    return np.asarray(_team_targets(flock, state.goal_pos, state.n_shepherds, flock_radius, collect, drive, v_angle))
+
+
+@njit(cache=True)
+def _team_targets(flock, goal, p, flock_radius, collect, drive, v_angle):  # type: ignore[no-untyped-def]
+    gcm = np.zeros(2)
+    for i in range(len(flock)):
+        gcm += flock[i]
+    gcm /= len(flock)
+    far = np.empty(len(flock))
+    for i in range(len(flock)):
+        far[i] = math.hypot(flock[i, 0] - gcm[0], flock[i, 1] - gcm[1])
+    x, y = gcm[0] - goal[0], gcm[1] - goal[1]
+    behind = math.atan2(y, x)  # 0 with the centroid on the goal's centre: any side will do
+    targets = np.empty((p, 2))
+    for k in range(p):
+        theta = behind + (k - (p - 1) / 2) * v_angle
+        targets[k, 0] = gcm[0] + drive * math.cos(theta)
+        targets[k, 1] = gcm[1] + drive * math.sin(theta)
+    for k in range(min(p, len(flock))):
+        furthest = np.argmax(far)
+        if not far[furthest] > flock_radius:
+            break
+        scale = 1 + collect / far[furthest]
+        targets[k, 0] = gcm[0] + scale * (flock[furthest, 0] - gcm[0])
+        targets[k, 1] = gcm[1] + scale * (flock[furthest, 1] - gcm[1])
+        far[furthest] = -1.0
+    return targets

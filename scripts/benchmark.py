@@ -20,7 +20,7 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from shepherd_phys.controllers import StrombomTeam
+from shepherd_phys.controllers.strombom import StrombomSettings, StrombomTeam
 from shepherd_phys.envs import ShepherdingEnv
 from shepherd_phys.flock import Strombom
 from shepherd_phys.lidar import Lidar, Stack, encode
@@ -32,6 +32,8 @@ from .impacts import impacts
 from .plain import PlainWorld
 from .throughput import throughput
 
+LENGTHS = StrombomSettings()
+"""Of the team that drives: not the tuned ones, so that the load stays the same when those change."""
 SEED = 0
 """Root seed of the episodes that are timed (tuning seeds)."""
 REFERENCE = {"substeps": 1, "iterations": 10}
@@ -89,7 +91,7 @@ class Driven:
 
     def __init__(self, world: World, step: Callable[[Any], Any], reset: Callable[[int], Any]) -> None:
         self.world, self.step, self._reset = world, Stopwatch(step), reset
-        self.team = StrombomTeam()
+        self.team = StrombomTeam(LENGTHS)
 
     def reset(self, seed: int) -> None:
         """Begin an episode; its Space is new, so its stopwatch is, too."""
@@ -154,7 +156,7 @@ def drive(scenario: Scenario, n_steps: int, seed: int, *, with_plain: bool = Tru
 def parts(scenario: Scenario) -> dict[str, float]:
     """Microseconds of each part of a step, on a state in the middle of driving, each timed alone."""
     env = ShepherdingEnv(scenario, rewards="wild")
-    team = StrombomTeam()
+    team = StrombomTeam(LENGTHS)
     env.reset(seed=SEED)
     team.reset(env.user_rng)
     while True:
@@ -217,7 +219,7 @@ def scaling(counts: tuple[int, ...] = (100, 1_000, 10_000)) -> dict[str, float]:
 
 def overlaps(scenario: Scenario, n_steps: int = 1_500) -> dict[str, float]:
     """How deep sheep are in one another and in shepherds while driven, at the end of each control step [m]."""
-    world, team, seed = World(scenario), StrombomTeam(), SEED
+    world, team, seed = World(scenario), StrombomTeam(LENGTHS), SEED
     deepest: list[float] = []
     while len(deepest) < n_steps:
         world.reset(seed)

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import json
-import os
 import sys
-import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TextIO
 
@@ -18,34 +14,20 @@ import numpy as np
 import tyro
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from shepherd_phys import __version__, campaign
 from shepherd_phys.campaign import CampaignError, Ledger
-from shepherd_phys.cluster import Cluster
 from shepherd_phys.controllers.evaluation import LABELS, ControllerError, trial_seed
 from shepherd_phys.envs.shepherding import ShepherdingEnv
 from shepherd_phys.scenario import SCENARIOS
 from shepherd_phys.settings import SettingsError, read_toml
 
+from .command import at_least, cpu_count, fail, flag, parsed, progress_bar, workforce
 from .pictures import picture
 from .points import episode, place, points, table, tasks, write_tables
 
 PROG = "shepherd-phys evaluate"
-LOG_SECONDS = 30.0
-"""Progress is a line so often where standard error is no terminal [s]."""
-
-
-def cpu_count() -> int:
-    """Processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _flag(metavar: str, default: str | None = None) -> Any:
-    """How ``--help`` shows a flag; ``default`` in words where the value does not tell."""
-    hint = f"(default: {default})" if default else default
-    return tyro.conf.arg(metavar=metavar, help_behavior_hint=hint)
 
 
 @dataclass(frozen=True)
@@ -57,41 +39,41 @@ class Evaluate:
     ledger that lets a stopped campaign continue: give the same command again.
     """
 
-    controllers: Annotated[tuple[str, ...], _flag("NAME ..")] = ("strombom",)
+    controllers: Annotated[tuple[str, ...], flag("NAME ..")] = ("strombom",)
     """Controllers by name, or module:Name of your own (imported from the current directory)."""
-    flocks: Annotated[tuple[int, ...], _flag("K ..", "the scenario's")] = ()
+    flocks: Annotated[tuple[int, ...], flag("K ..", "the scenario's")] = ()
     """Numbers of flocks."""
-    cohesion: Annotated[tuple[int, ...], _flag("N ..", "the scenario's")] = ()
+    cohesion: Annotated[tuple[int, ...], flag("N ..", "the scenario's")] = ()
     """Numbers of neighbours that attract a sheep."""
-    shepherds: Annotated[tuple[int, ...], _flag("M ..", "the scenario's")] = ()
+    shepherds: Annotated[tuple[int, ...], flag("M ..", "the scenario's")] = ()
     """Numbers of shepherds."""
-    sheep: Annotated[int | None, _flag("N", "the scenario's")] = None
+    sheep: Annotated[int | None, flag("N", "the scenario's")] = None
     """Number of sheep."""
-    scenario: Annotated[str, _flag("NAME|FILE")] = "paper"
+    scenario: Annotated[str, flag("NAME|FILE")] = "paper"
     """A preset's name or a TOML file."""
-    body: Annotated[str | None, _flag("NAME|module:Name", "the scenario's")] = None
+    body: Annotated[str | None, flag("NAME|module:Name", "the scenario's")] = None
     """Body of every shepherd; those that the file describes as such keep their parameters."""
-    flock: Annotated[str | None, _flag("NAME|module:Name", "the scenario's")] = None
+    flock: Annotated[str | None, flag("NAME|module:Name", "the scenario's")] = None
     """Flock model; if the file describes such a one, with its parameters."""
-    baseline: Annotated[str | None, _flag("NAME", "the first of --controllers")] = None
+    baseline: Annotated[str | None, flag("NAME", "the first of --controllers")] = None
     """The controller from which the others' differences are told, paired by seed."""
-    trials: Annotated[int, _flag("T")] = 100
+    trials: Annotated[int, flag("T")] = 100
     """Episodes a point."""
-    seed: Annotated[int, _flag("S")] = 20_000
+    seed: Annotated[int, flag("S")] = 20_000
     """Root seed: trial i has a seed derived from S and i alone, the same for every controller and point."""
-    grid: Annotated[Path | None, _flag("FILE", "")] = None
+    grid: Annotated[Path | None, flag("FILE", "")] = None
     """A TOML file with any of the options above, e.g. flocks = [1, 2]."""
-    shard: Annotated[str | None, _flag("I/N", "")] = None
+    shard: Annotated[str | None, flag("I/N", "")] = None
     """Run only the I-th of N equal parts (1-based), for machines that share nothing."""
-    workers: Annotated[int, _flag("W")] = cpu_count()
+    workers: Annotated[int, flag("W")] = cpu_count()
     """Worker processes; the results do not depend on it."""
-    scheduler: Annotated[str | None, _flag("ADDRESS", "")] = None
+    scheduler: Annotated[str | None, flag("ADDRESS", "")] = None
     """Instead of --workers: the scheduler of a Dask cluster, e.g. tcp://10.0.0.1:8786."""
-    timeout: Annotated[float, _flag("SECONDS")] = 600.0
+    timeout: Annotated[float, flag("SECONDS")] = 600.0
     """An episode that takes longer counts as hung."""
-    out: Annotated[Path, _flag("DIR")] = Path("results")
+    out: Annotated[Path, flag("DIR")] = Path("results")
     """Folder for tables and ledger; an unfinished campaign in it is continued."""
-    gather: Annotated[tuple[Path, ...], _flag("DIR ..", "")] = ()
+    gather: Annotated[tuple[Path, ...], flag("DIR ..", "")] = ()
     """Folders of other campaigns, such as shards: episodes that they have are taken over and not run."""
     json: tyro.conf.FlagCreatePairsOff[bool] = False
     """Print the summary as one JSON array, and nothing else, on standard output."""
@@ -100,8 +82,6 @@ class Evaluate:
 POINT_KEYS = ("controllers", "flocks", "cohesion", "shepherds", "sheep", "scenario", "body", "flock")
 GRID_KEYS = (*POINT_KEYS, "baseline", "trials", "seed")
 LISTS = {"controllers": str, "flocks": int, "cohesion": int, "shepherds": int}
-WANTED = dict.fromkeys(("flocks", "cohesion", "shepherds"), "whole numbers")
-WANTED |= dict.fromkeys(("sheep", "trials", "seed", "workers"), "a whole number") | {"timeout": "a number of seconds"}
 LEAST = {"flocks": 1, "cohesion": 1, "shepherds": 0, "sheep": 1, "trials": 1, "seed": 0, "workers": 1}
 
 
@@ -110,7 +90,7 @@ def main(argv: Sequence[str]) -> int:
     try:
         options = read_options(argv)
     except SettingsError as error:
-        return _fail(error, 2)
+        return fail(PROG, error, 2)
     out = sys.stdout
     with contextlib.redirect_stdout(sys.stderr):  # a user's classes may print wherever they are touched
         return _main(options, out)
@@ -123,24 +103,31 @@ def _main(options: Evaluate, out: TextIO) -> int:
         seeds = [trial_seed(options.seed, trial) for trial in range(options.trials)]
         todo = campaign.shard(tasks(grid, seeds), part, count)
     except (SettingsError, ControllerError) as error:
-        return _fail(error, 2)
+        return fail(PROG, error, 2)
     with progress_bar() as report:
         try:
             ledger = ready(options.out, todo, options.gather)
         except (SettingsError, CampaignError) as error:
-            return _fail(error, 2)
+            return fail(PROG, error, 2)
         with ledger:
             try:
                 outcome = campaign.run(
-                    todo, episode, workers=workforce(options), ledger=ledger, timeout=options.timeout, report=report
+                    todo,
+                    episode,
+                    workers=workforce(PROG, options.workers, options.scheduler),
+                    ledger=ledger,
+                    timeout=options.timeout,
+                    report=report,
                 )
                 summary, paths = write_tables(options.out, table(todo, outcome), options.baseline)
                 if todo and outcome.rows[0] is not None:
                     paths += picture(todo[0], ledger, PROG)
             except CampaignError as error:
-                return _fail(error, 1)
+                return fail(PROG, error, 1)
             except KeyboardInterrupt:
-                return _fail(f"stopped; what was finished is kept in {ledger.path}: the same command continues", 130)
+                return fail(
+                    PROG, f"stopped; what was finished is kept in {ledger.path}: the same command continues", 130
+                )
     if options.json:
         print(json.dumps(summary, allow_nan=False, indent=1), file=out)
     else:
@@ -153,13 +140,6 @@ def _main(options: Evaluate, out: TextIO) -> int:
     return 1 if outcome.failures else 0
 
 
-def workforce(options: Evaluate) -> int | campaign.Hire:
-    """Who does the work."""
-    if options.scheduler is None:
-        return options.workers
-    return partial(Cluster, address=options.scheduler, say=lambda text: print(f"{PROG}: {text}", file=sys.stderr))
-
-
 def ready(folder: Path, todo: Sequence[campaign.Task], sources: Sequence[Path] = ()) -> Ledger:
     """The folder's ledger with what other folders have, when what is still to be run has been rehearsed.
 
@@ -168,6 +148,8 @@ def ready(folder: Path, todo: Sequence[campaign.Task], sources: Sequence[Path] =
         CampaignError: the folder is not to be had, or nothing can be gathered from a source.
     """
     taken = campaign.gathered(sources, __version__, todo)
+    if sources:
+        print(f"gathered {len(taken)} of {len(todo)} episodes", file=sys.stderr)
     is_new = not (folder / campaign.LEDGER).exists()
     if is_new:
         rehearse([task for task in todo if task.key not in taken])
@@ -201,11 +183,6 @@ def rehearse(todo: Sequence[campaign.Task]) -> None:
         place(task.spec, seeds[task.settings_hash][:3])
 
 
-def _fail(error: object, status: int) -> int:
-    print(f"{PROG}: {' '.join(str(error).split())}", file=sys.stderr)
-    return status
-
-
 def read_options(argv: Sequence[str]) -> Evaluate:
     """The options from the command line and the grid file, checked.
 
@@ -213,34 +190,17 @@ def read_options(argv: Sequence[str]) -> Evaluate:
         SettingsError: something is unknown, given twice or impossible.
         SystemExit: after ``--help``.
     """
-    said = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(said):
-            options = tyro.cli(Evaluate, prog=PROG, args=list(argv))
-    except SystemExit as end:
-        if not end.code:
-            raise
-        problem = _one_line(said.getvalue())
-        wanted = [f"; --{name} takes {what}" for name, what in WANTED.items() if f"--{name}" in problem]
-        raise SettingsError(f"{problem}{''.join(wanted[:1])} (see {PROG} --help)") from None
-    flags = {f.name for f in fields(Evaluate) if any(a == f"--{f.name}" or a.startswith(f"--{f.name}=") for a in argv)}
+    options, flags = parsed(Evaluate, PROG, argv)
     values = {f.name: getattr(options, f.name) for f in fields(Evaluate)}
     for name in (*LISTS, "gather"):
         if name in flags and not values[name]:
             raise SettingsError(f"--{name}: needs at least one value")
-    if {"workers", "scheduler"} <= flags:
-        raise SettingsError("--workers and --scheduler: the workers are the cluster's then; leave one of the two out")
     if options.grid is not None:
         for name, value in read_grid(options.grid).items():
             if name in flags:
                 raise SettingsError(f"--{name} is given and {options.grid} sets {name} too: leave one of them out")
             values[name] = value
-    for name, least in LEAST.items():
-        for number in values[name] if name in LISTS else [values[name]]:
-            if number is not None and number < least:
-                raise SettingsError(f"{name}: {number} is impossible; it must be at least {least}")
-    if not values["timeout"] > 0:
-        raise SettingsError(f"timeout: {values['timeout']} is impossible; it must be above 0 s")
+    at_least(values, LEAST)
     controllers = tuple(dict.fromkeys(values["controllers"]))
     if values["baseline"] not in (None, *controllers):
         raise SettingsError(f"baseline: {values['baseline']!r} is not among the controllers ({', '.join(controllers)})")
@@ -281,23 +241,6 @@ def read_shard(text: str | None) -> tuple[int, int]:
     if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
         raise SettingsError(f"shard: {text!r} is impossible; it must be I/N with 1 <= I <= N, e.g. 2/4")
     return int(number), int(count)
-
-
-def _one_line(box: str) -> str:
-    """What a box of tyro's says, without its title, frame and the help below the message's rule.
-
-    Where standard output is not UTF-8, the frame is of blanks and hyphens, and the title has a rule of its own.
-    """
-    framed = "╭" in box
-    parts: list[list[str]] = [[]]
-    for line in box.splitlines():
-        line = line.strip("│ ")
-        if line and not line.strip("─-"):
-            parts.append([])
-        elif not line.startswith(("╭", "╰")):
-            parts[-1].append(line)
-    message = parts[0] if framed or len(parts) == 1 else parts[1]
-    return " ".join(" ".join(message).split())
 
 
 METRICS = {
@@ -348,47 +291,3 @@ def _print_rows(rows: Sequence[Mapping[str, Any]], title: str, suffix: str, out:
     if not console.is_terminal:
         console.width = 200  # a file has no edge to wrap at
     console.print(grid)
-
-
-@contextlib.contextmanager
-def progress_bar() -> Iterator[Any]:
-    """A bar with rate and time left on standard error; a function for `campaign.run` to report to."""
-    console = Console(stderr=True)
-    bar = Progress(
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[pace]}"),
-        TimeElapsedColumn(),
-        console=console,
-        disable=not console.is_terminal,
-    )
-    shown = bar.add_task("episodes", total=None, pace="starting")
-    logged = time.monotonic()
-    first: tuple[float, int] | None = None
-    before: int | None = None
-
-    def report(now: campaign.Progress) -> None:
-        nonlocal logged, first, before
-        ended = now.done + now.failed
-        before = ended if before is None else before
-        if first is None and ended > before:
-            first = time.monotonic(), ended  # the pace is counted from here: until here workers were starting
-        pace = "starting"
-        if first is not None and ended > first[1]:
-            rate = (ended - first[1]) / (time.monotonic() - first[0])
-            pace = f"{rate:.2f} episodes/s, {_clock((now.total - ended) / rate)} left"
-        if now.failed:
-            pace += f", {now.failed} failed"
-        bar.update(shown, total=now.total, completed=ended, pace=pace)
-        if not console.is_terminal and time.monotonic() - logged > LOG_SECONDS:
-            logged = time.monotonic()
-            print(f"{ended}/{now.total} episodes: {pace}", file=sys.stderr, flush=True)
-
-    with bar:
-        yield report
-
-
-def _clock(seconds: float) -> str:
-    minutes, seconds = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{seconds:02d}"

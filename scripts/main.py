@@ -12,7 +12,9 @@ from shepherd_phys import __version__
 COMMANDS = {
     "evaluate": "run controllers over a grid of experiments and write the tables",
     "train": "learn a policy, with checkpoints from which a stopped run goes on",
+    "tune": "search the lengths of a heuristic team on tuning seeds",
     "benchmark": "measure how fast the simulator is on this machine",
+    "reproduce": "run the paper's experiments, draw its figures and judge its claims",
 }
 """A command is the file of its name in this folder, with ``main(argv) -> exit status``."""
 

@@ -20,7 +20,7 @@ from typing import Any
 
 from shepherd_phys import __version__
 from shepherd_phys.bodies import BODIES, Body, Disc
-from shepherd_phys.campaign import Outcome, Task, settings_hash, write_csv, write_parquet
+from shepherd_phys.campaign import Outcome, Task, remove, settings_hash, write_csv, write_parquet
 from shepherd_phys.controllers import CONTROLLERS, Controller, Policy, load_policy
 from shepherd_phys.controllers.evaluation import (
     COLUMNS,
@@ -223,14 +223,16 @@ def write_tables(
     differences = paired_differences(rows, baseline) if baseline is not None and paired else []
     told = {_labels(row): {name: row[name] for name in row if name not in LABELS} for row in differences}
     write_csv(folder / "episodes.csv", COLUMNS, rows)
-    written = {"episodes.csv": True, "episodes.parquet": write_parquet(folder / "episodes.parquet", KINDS, rows)}
     write_csv(folder / "summary.csv", summary_columns(), summary)
-    written |= {"summary.csv": True, "differences.csv": baseline is not None}
     if baseline is not None:
         write_csv(folder / "differences.csv", difference_columns(), differences)
-    for name, is_new in written.items():
-        if not is_new:
-            (folder / name).unlink(missing_ok=True)
+    written = {
+        "episodes.csv": True,
+        "episodes.parquet": write_parquet(folder / "episodes.parquet", KINDS, rows),
+        "summary.csv": True,
+        "differences.csv": baseline is not None,
+    }
+    remove(folder / name for name, is_new in written.items() if not is_new)
     paths = [folder / name for name, is_new in written.items() if is_new]
     return [{**row, "differences": told.get(_labels(row))} for row in summary], paths
 

@@ -177,6 +177,29 @@ def _ended_jobs(waiting: deque[Job], work: Work, workers: int | Hire, timeout: f
         raise CampaignError(str(error)) from error
 
 
+def remove(paths: Iterable[Path]) -> None:
+    """Remove files, those that are there.
+
+    Raises:
+        CampaignError: one cannot be removed.
+    """
+    for path in paths:
+        try:
+            path.unlink(missing_ok=True)
+        except OSError as error:
+            raise CampaignError(f"{path}: is of an earlier run and cannot be removed ({error.strerror})") from None
+
+
+def write_bytes(path: str | Path, content: bytes) -> None:
+    """Write a file, which appears whole or not at all.
+
+    Raises:
+        CampaignError: it cannot be written.
+    """
+    with _table(Path(path)) as part:
+        part.write_bytes(content)
+
+
 def write_csv(path: str | Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
     """Write rows as CSV; the file appears whole or not at all.
 
@@ -247,7 +270,12 @@ def _cell(value: Any) -> str:
 
 
 def shard(tasks: Sequence[Task], number: int, count: int) -> list[Task]:
-    """Every ``count``-th task, beginning with the ``number``-th (1-based): shards share nothing and leave out none."""
+    """The tasks of every ``count``-th seed, beginning with the ``number``-th (1-based).
+
+    Shards share nothing and leave out none. Seeds are not split: so a shard has every point, costs as much as another,
+    and its comparisons are paired.
+    """
     if not 1 <= number <= count:
         raise ValueError(f"shard: needs I/N with 1 <= I <= N (given: {number}/{count})")
-    return list(tasks[number - 1 :: count])
+    own = set(list(dict.fromkeys(task.seed for task in tasks))[number - 1 :: count])
+    return [task for task in tasks if task.seed in own]

@@ -35,8 +35,6 @@ RESTART_SECONDS = 20.0
 """For the restart of a hanging worker [s]."""
 PATIENCE_SECONDS = 15.0
 """Workers that take longer to answer for the first time are worth a word [s]."""
-QUEUE = 1
-"""Jobs that wait at each worker beside those that its threads do: it need not idle while the next is on its way."""
 
 
 @dataclass(eq=False)
@@ -51,7 +49,11 @@ class _Sent:
 
 @dataclass(eq=False)
 class _Site:
-    """A Dask worker, and what it was given, in that order: as many as it has threads are being done."""
+    """A Dask worker, and what it is doing: never more than it has threads.
+
+    No job waits there for another's end: a worker that dies takes with it what it had finished and not yet handed over,
+    so a job that is begun the moment another ends, and kills its worker, would cost that other too.
+    """
 
     address: str
     threads: int
@@ -69,19 +71,19 @@ class _Site:
     @property
     def room(self) -> float:
         """Jobs that it can still take, by thread."""
-        return (self.threads + QUEUE - len(self.sent)) / self.threads if self.ready and self.open else 0.0
+        return (self.threads - len(self.sent)) / self.threads if self.ready and self.open else 0.0
 
 
 class Cluster:
     """The workers of a Dask cluster doing ``work``, those that join later too. A context manager.
 
-    A job whose worker dies has failed; one that only waited there is given to another worker and has lost nothing. A
-    job that takes too long has failed too: its worker is restarted, where a nanny watches it, or left alone.
-    The scheduler is told nothing that concerns other users of it.
+    A job whose worker dies has failed. A job that takes too long has failed too: its worker is restarted, where a nanny
+    watches it, or ended; what else it was doing of ours is given to another and has lost nothing. (Other users' jobs on
+    that worker are restarted with it.) Otherwise the scheduler is told nothing that concerns others.
 
     Args:
         work: the function; workers import it.
-        timeout: of one job, from the time at which a thread is free for it [s].
+        timeout: of one job [s].
         address: of the scheduler.
         say: is told, in a line, what the user should know.
     """
@@ -169,7 +171,6 @@ class Cluster:
             yield from self._bury(site)
         else:
             site.sent.remove(sent)
-            self._start_clocks(site)
             if isinstance(result, BaseException):
                 yield Ended(sent.job.key, None, f"lost by the cluster: {explain(result)}")
             else:
@@ -215,9 +216,9 @@ class Cluster:
     def _bury(self, site: _Site) -> list[Ended]:
         """A worker has died: the jobs that it was doing."""
         del self._sites[site.address]
-        doing, waiting = site.sent[: site.threads], site.sent[site.threads :]
-        self._leave(site, waiting)
-        return [Ended(sent.job.key, None, f"worker died ({site.address})") for sent in doing]
+        lost = site.sent
+        self._leave(site, [])
+        return [Ended(sent.job.key, None, f"worker died ({site.address})") for sent in lost]
 
     def _end_overdue(self) -> list[Ended]:
         """Give up jobs that hang, and restart their workers."""
@@ -251,15 +252,13 @@ class Cluster:
         """Give up a worker; jobs that lost nothing by it look for another."""
         self._drop(site.sent)
         site.sent = []
-        for sent in innocent:
-            sent.deadline = float("inf")
-            self._homeless.append(sent)
+        self._homeless += innocent
 
     def _send(self, sent: _Sent) -> None:
         site = max(self._sites.values(), key=lambda site: site.room)
         site.sent.append(sent)
+        sent.deadline = time.monotonic() + self._timeout
         sent.future = self._submit(site, sent, _doing(), self._work, sent.pickled)
-        self._start_clocks(site)
 
     def _submit(self, site: _Site, sent: _Sent | None, function: Any, *arguments: bytes) -> Any:
         """Have a worker, and no other, do something; what comes of it arrives as news."""
@@ -292,10 +291,6 @@ class Cluster:
         if futures:
             with suppress(Exception):
                 self._client.cancel(futures)
-
-    def _start_clocks(self, site: _Site) -> None:
-        for sent in site.sent[: site.threads]:
-            sent.deadline = min(sent.deadline, time.monotonic() + self._timeout)
 
     def _comment(self) -> None:
         """Say once why nothing goes on."""

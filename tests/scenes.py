@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from shepherd_phys.controllers.formation import SubFlocks
 from shepherd_phys.scenario import Scenario
 from shepherd_phys.world import World
 
@@ -22,3 +23,9 @@ def arranged(sheep, shepherds, goal=(0.0, 0.0)):
         sheep_in_goal=away <= 2.5,
         sheep_arrived=away <= 2.5,
     )
+
+
+def one_flock(sheep, goal=(0.0, 0.0)):
+    """All these sheep as the only sub-flock out."""
+    sheep = np.array(sheep, float)
+    return SubFlocks([sheep], sheep.mean(axis=0)[None], np.hypot(*(sheep - goal).T).max(keepdims=True))

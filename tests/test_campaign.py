@@ -526,15 +526,20 @@ def test_floats_survive_the_table(number):
 
 @given(st.integers(0, 300), st.integers(1, 20))
 def test_shards_are_disjoint_even_and_leave_out_nothing(n, count):
-    parts = [shard(range(n), i, count) for i in range(1, count + 1)]
-    assert sorted(i for part in parts for i in part) == list(range(n))
-    assert max(map(len, parts)) - min(map(len, parts)) <= 1
+    tasks = [Task(name, 7 * seed, None) for seed in range(n) for name in ("a", "b")]
+    parts = [shard(tasks, i, count) for i in range(1, count + 1)]
+    assert sorted(task.key for part in parts for task in part) == sorted(task.key for task in tasks)
+    assert max(map(len, parts)) - min(map(len, parts)) <= 2
+    for part in parts:  # every point has the same seeds
+        assert [task.seed for task in part if task.settings_hash == "a"] == [
+            task.seed for task in part if task.settings_hash == "b"
+        ]
 
 
 @pytest.mark.parametrize(("number", "count"), [(0, 1), (2, 1), (1, 0), (-1, 3)])
 def test_impossible_shards(number, count):
     with pytest.raises(ValueError, match="shard: needs I/N"):
-        shard(range(5), number, count)
+        shard([Task("a", seed, None) for seed in range(5)], number, count)
 
 
 def test_settings_hash_is_of_the_content():

@@ -56,21 +56,15 @@ class Dask:
         self.address = json.loads(file.read_text())["address"]
         return process
 
-    def worker(self, *words, path=TESTS, threads=1):
-        local = ["--local-directory", str(self.folder)]
-        return self.start(
-            "worker", self.address, "--nthreads", str(threads), "--no-dashboard", *local, *words, path=path
-        )
+    def worker(self, *, path=TESTS, threads=1, nanny=False):
+        """A nanny watches a worker and begins it anew; it makes it slower to start and to end."""
+        words = ["--local-directory", str(self.folder), "--nanny" if nanny else "--no-nanny"]
+        return self.start("worker", self.address, "--nthreads", str(threads), "--no-dashboard", *words, path=path)
 
     def end(self):
         for process in self.processes:
-            process.terminate()
-        for process in self.processes:
-            try:
-                process.wait(20)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+            process.kill()  # the worker of a nanny ends with it; a polite end waits for others that end, too
+            process.wait()
 
 
 @pytest.fixture
@@ -92,7 +86,7 @@ def whole(tmp_path, todo):
 
 def test_a_killed_worker_loses_nothing(tmp_path, dask):
     todo = jobs.tasks(80)
-    workers = [dask.worker("--no-nanny") for _ in range(2)]
+    workers = [dask.worker() for _ in range(2)]
     killed = []
 
     def kill_one(progress):
@@ -108,7 +102,7 @@ def test_a_killed_worker_loses_nothing(tmp_path, dask):
 def test_episodes_that_die_or_throw_are_lost_alone(tmp_path, dask):
     todo = [task for task in jobs.tasks(50) if task.seed < 8 or task.seed == 43]
     for _ in range(2):
-        dask.worker()
+        dask.worker(nanny=True)
     outcome = run_in(tmp_path / "cluster", todo, jobs.faulty_row, on(dask), retries=1)
     assert [failure.task.seed for failure in outcome.failures] == [3, 43]
     for failure, cause in zip(outcome.failures, ["worker died", "RuntimeError: no luck with 43"], strict=True):
@@ -117,12 +111,12 @@ def test_episodes_that_die_or_throw_are_lost_alone(tmp_path, dask):
     assert [seed for _, seed, _ in ledger_rows(tmp_path / "cluster")] == [0, 1, 2, 4, 5, 6, 7]
 
 
-@pytest.mark.parametrize("words", [(), pytest.param(("--no-nanny",), marks=pytest.mark.slow)], ids=["nanny", "none"])
-def test_an_episode_that_hangs_is_lost_alone(tmp_path, dask, words):
+@pytest.mark.parametrize("nanny", [True, pytest.param(False, marks=pytest.mark.slow)], ids=["nanny", "none"])
+def test_an_episode_that_hangs_is_lost_alone(tmp_path, dask, nanny):
     todo = [task for task in jobs.tasks(40) if task.seed > 28]
-    dask.worker(*words, threads=2)
-    if words:
-        dask.worker(*words)  # the other one is not begun anew
+    dask.worker(threads=2, nanny=nanny)
+    if not nanny:
+        dask.worker()  # the other one is not begun anew
     outcome = run_in(tmp_path / "cluster", todo, jobs.hanging_row, on(dask), timeout=10.0, retries=0)
     assert [(failure.task.seed, failure.cause) for failure in outcome.failures] == [(33, "hung: no end after 10 s")]
     assert outcome.computed == 10

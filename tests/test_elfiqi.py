@@ -4,10 +4,16 @@ import math
 
 import numpy as np
 import pytest
-from scenes import NOTHING, arranged
+from scenes import NOTHING, arranged, one_flock
 
 from shepherd_phys.controllers import Elfiqi, ElfiqiLiteral
-from shepherd_phys.controllers.elfiqi import elfiqi_targets, nearest_strays, shepherd_repulsion, undisturbing
+from shepherd_phys.controllers.elfiqi import (
+    ElfiqiSettings,
+    elfiqi_targets,
+    nearest_strays,
+    shepherd_repulsion,
+    undisturbing,
+)
 from shepherd_phys.obstacles import Pillar
 
 COMPACT = [[21, 0], [19, 0], [20, 1], [20, -1]]
@@ -68,6 +74,6 @@ def test_published_obstacles_repel():
 
 
 def test_tuned_drivers_fan_out_to_fixed_places_without_crossing():
-    targets = Elfiqi()._targets(arranged(COMPACT, [[32, 3], [32, -3], [32, 0]]), [np.array(COMPACT, float)])
+    targets = Elfiqi(ElfiqiSettings())._targets(arranged(COMPACT, [[32, 3], [32, -3], [32, 0]]), one_flock(COMPACT))
     side, up = 8.5 * math.cos(math.pi / 6), 8.5 / 2
     assert targets == pytest.approx(np.array([[20 + side, up], [20 + side, -up], [28.5, 0]]))

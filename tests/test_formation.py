@@ -5,11 +5,12 @@ import pytest
 from scenes import NOTHING, arranged
 
 from shepherd_phys.controllers import CONTROLLERS
-from shepherd_phys.controllers.formation import Surroundings, beyond, flocks_out, in_order, leak_places
+from shepherd_phys.controllers.formation import Surroundings, beyond, flocks_out, in_order, leak_places, make_way
 from shepherd_phys.controllers.strombom import StrombomTeam
 from shepherd_phys.envs import ShepherdingEnv
-from shepherd_phys.obstacles import Pillar
+from shepherd_phys.obstacles import Pillar, Wall
 from shepherd_phys.scenario import Scenario
+from shepherd_phys.world import World
 
 TUNED = ("strombom", "pierson", "elfiqi", "occlusion")
 
@@ -22,9 +23,9 @@ def flocks(*places):
 def test_sub_flocks_not_home_soonest_done_first_and_crumbs_last():
     sheep = [*flocks([20, 0], [0, 12], [-5, 0]), [7, 7]]
     state = arranged(sheep, [[30, 0]])
-    assert [f[0].tolist() for f in flocks_out(state, 3.0, 5.5)] == [[7, 7], [0, 12], [20, 0]]
-    assert [f[0].tolist() for f in flocks_out(state, 3.0, 5.5, crumb=0.2)] == [[0, 12], [20, 0], [7, 7]]
-    assert flocks_out(state, 3.0, 25.0, crumb=0.2) == []
+    assert [f[0].tolist() for f in flocks_out(state, 3.0, 5.5).sheep] == [[7, 7], [0, 12], [20, 0]]
+    assert [f[0].tolist() for f in flocks_out(state, 3.0, 5.5, crumb=0.2).sheep] == [[0, 12], [20, 0], [7, 7]]
+    assert flocks_out(state, 3.0, 25.0, crumb=0.2).sheep == []
 
 
 def test_a_team_keeps_to_its_sub_flock_until_another_is_much_sooner_done():
@@ -81,3 +82,36 @@ def test_every_tuned_team_delivers_two_flocks_and_holds_them(name, n_shepherds):
     for _ in range(1000):
         observation, *_, info = env.step(controller.act(observation, env.state))
     assert info["in_goal"] > 0.9
+
+
+def test_two_that_meet_head_on_both_step_to_their_right():
+    pos, targets = np.array([[0.0, 0.0], [0.6, 0.0], [0.3, 5.0]]), np.array([[5.0, 0.0], [-5.0, 0.0], [0.3, 9.0]])
+    aside = make_way(pos, targets)
+    assert aside[0] == pytest.approx([np.cos(1.2), -np.sin(1.2)])
+    assert aside[1] == pytest.approx([0.6 - np.cos(1.2), np.sin(1.2)])
+    assert aside[2].tolist() == [0.3, 9.0]
+    behind = make_way(pos[:2], np.array([[5.0, 0.0], [5.0, 0.0]]))
+    assert behind[1].tolist() == [5.0, 0.0]  # who is in front goes on
+    arrived = make_way(pos[:2], pos[:2])
+    assert arrived.tolist() == pos[:2].tolist()
+
+
+WALLED = (Wall((-15.0, 0.0), (-4.0, 0.0)), Wall((4.0, 0.0), (15.0, 0.0)), Wall((0.0, 6.0), (0.0, 18.0)))
+
+
+@pytest.mark.parametrize("name", TUNED)
+def test_every_tuned_team_walks_and_leads_its_flock_round_walls(name):
+    world = World(Scenario(n_sheep=40, n_flocks=1, obstacles=WALLED))
+    drawn = world.reset(0)
+    # the goal is on one side of the first wall, flock and shepherds are on the other
+    flock = drawn.sheep_pos - drawn.sheep_pos.mean(axis=0) + (-9.5, -8.0)
+    start = drawn.but(goal_pos=(-10.0, 10.0), sheep_pos=flock, shepherd_pos=[(-20, -10), (-14, 4), (-8, 15)])
+    state = world.reset_to(start, seed=1)
+    controller = CONTROLLERS[name]()
+    controller.reset(world.user_rng)
+    surfaces, nearest = Surroundings().of(WALLED), np.inf
+    for _ in range(700):
+        state = world.step(controller.act(NOTHING, state))
+        nearest = min(nearest, surfaces.static_distances(state.shepherd_pos)[0].min())
+    assert state.sheep_in_goal.mean() >= 0.95
+    assert nearest > 0.25  # the radius of a shepherd: none touched a wall

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from scenes import arranged
+from scenes import arranged, one_flock
 
 from shepherd_phys.controllers import Occlusion
 from shepherd_phys.controllers.formation import WEDGE
@@ -56,5 +56,5 @@ def test_sheep_behind_the_goal_hide_nothing():
 def test_behind_a_long_flock_it_stands_near_enough_to_be_felt():
     """R_c is 9 m across; towards the shepherd the flock reaches 1 m."""
     sheep = np.array([[20, y] for y in range(-9, 10)] + [[21, 0], [19, 0]], float)
-    targets = Occlusion()._targets(arranged(sheep, [[30, 0]]), [sheep])
+    targets = Occlusion()._targets(arranged(sheep, [[30, 0]]), one_flock(sheep))
     assert targets == pytest.approx(np.array([[25.0, 0.0]]))

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from scenes import NOTHING, arranged
+from scenes import NOTHING, arranged, one_flock
 
 from shepherd_phys.controllers import Pierson, PiersonReconstructed
 from shepherd_phys.controllers.pierson import PiersonGains, PiersonSettings, arc_places, arc_width
@@ -45,7 +45,7 @@ def test_tuned_places_go_to_shepherds_in_their_order_round_the_flock():
     sheep = [[21, 0], [19, 0], [20, 1], [20, -1]]
     team = Pierson()
     state = arranged(sheep, [[30, 5], [30, -5], [30, 0]])
-    targets = team._targets(state, [np.array(sheep, float)])
+    targets = team._targets(state, one_flock(sheep))
     side = 7 * math.cos(math.pi / 6)
     assert targets == pytest.approx(np.array([[20 + side, 3.5], [20 + side, -3.5], [27, 0]]))
 

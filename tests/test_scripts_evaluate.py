@@ -393,7 +393,7 @@ def test_parquet_is_the_same_table(folder, in_process):
 
 
 def test_a_shard_may_be_empty(folder, in_process, capsys):
-    assert run("--controllers", "idle", "--shard", "3/3", "--json") == 0
+    assert run("--controllers", "idle", "--trials", "2", "--shard", "3/3", "--json") == 0
     assert json.loads(capsys.readouterr().out) == []
     assert read("results/episodes.csv") == []
 
@@ -523,6 +523,7 @@ MISTAKES = [
     ("--workers 0", "workers: 0 is impossible; it must be at least 1"),
     ("--timeout 0", "timeout: 0.0 is impossible; it must be above 0 s"),
     ("--timeout nan", "timeout: nan is impossible"),
+    ("--scheduler nonsense", "scheduler: 'nonsense' is no address; it must be like tcp://HOST:PORT"),
     ("--shard 0/3", "shard: '0/3' is impossible; it must be I/N"),
     ("--shard 4/3", "shard: '4/3' is impossible; it must be I/N"),
     ("--shard half", "shard: 'half' is impossible; it must be I/N"),
@@ -654,7 +655,7 @@ def test_front_door(capsys):
         assert main.main(argv) == 2
         said = capsys.readouterr()
         assert said.out == ""
-        assert said.err.startswith(f"shepherd-phys: {problem}; commands are evaluate, train, benchmark")
+        assert said.err.startswith(f"shepherd-phys: {problem}; commands are {', '.join(main.COMMANDS)}")
 
 
 def test_commands_exist():

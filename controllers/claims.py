@@ -1,0 +1,400 @@
+"""The paper's two experiments and its claims about them, as tests on rows of ``episodes.csv``.
+
+A claim has parts, each a number with its 95 % bootstrap interval and the side on which it is claimed to lie. A part
+**holds** when its interval lies wholly on that side, **fails** when it lies wholly on the other, and is **undecided**
+otherwise, or where the trials that it needs were not all run. A claim holds when all its parts hold and fails when one
+fails.
+
+Which claims there are: "Perception-Based Rewards for Robotic Shepherd Teams Maneuvering Split Flocks", section 4.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .summary import LEVEL, bootstrap, intervals
+
+Floats = NDArray[np.float64]
+Row = Mapping[str, Any]
+At = tuple[int, int]
+"""A point of the experiments: (flocks, n), with n the neighbours in a sheep's cohesion."""
+
+HEURISTICS = ("strombom", "pierson", "elfiqi", "occlusion")
+"""Tuned heuristics: the rivals of c4 and c5."""
+PROPOSED = ("wild", "any")
+"""The paper's own: learned with an occlusion reward. "Learned" means these in c4 and c5."""
+LEARNED = ("original", "any", "wild", "collie")
+LITERAL = ("strombom-literal", "pierson-reconstructed", "elfiqi-literal")
+"""As published, without a terminal rule: never a rival, never counted."""
+COUNTED = (*HEURISTICS, "original", "any", "wild")
+"""Methods that c6 and c7 are about; what others show is reported beside it."""
+
+HOLDS, FAILS, UNDECIDED = "holds", "fails", "undecided"
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """One of the paper's experiments: what it varies. Three shepherds and 100 sheep throughout."""
+
+    title: str
+    varied: str
+    """The label that varies."""
+    axis: str
+    """What it is called in a figure."""
+    flocks: tuple[int, ...]
+    cohesion: tuple[int, ...]
+
+    @property
+    def points(self) -> tuple[At, ...]:
+        """Every (flocks, n)."""
+        return tuple((flocks, n) for flocks in self.flocks for n in self.cohesion)
+
+
+EXPERIMENTS = {
+    "figure2": Experiment(
+        "Figure 2: varying number of flocks", "n_flocks", "flocks at the start", (1, 2, 3, 4, 5), (40,)
+    ),
+    "figure3": Experiment(
+        "Figure 3: varying cohesion", "cohesion", "n, neighbours in a sheep's cohesion", (2,), (10, 25, 40, 55, 70, 85)
+    ),
+}
+FLOCKS, COHESION = EXPERIMENTS["figure2"].points, EXPERIMENTS["figure3"].points
+EVERYWHERE = tuple(dict.fromkeys((*FLOCKS, *COHESION)))
+
+
+@dataclass(frozen=True)
+class Side:
+    """The claimed side: numbers from ``least`` to ``most``, these two included unless ``strict``."""
+
+    least: float = -math.inf
+    most: float = math.inf
+    strict: bool = False
+
+    def verdict(self, low: float, high: float) -> str:
+        """What the interval from ``low`` to ``high`` says; nothing where an end is not a number."""
+        if math.isnan(low) or math.isnan(high):
+            return UNDECIDED
+        if self._holds(low) and self._holds(high):
+            return HOLDS
+        if high < self.least or low > self.most or (self.strict and (high == self.least or low == self.most)):
+            return FAILS
+        return UNDECIDED
+
+    def _holds(self, number: float) -> bool:
+        if self.strict:
+            return self.least < number < self.most
+        return self.least <= number <= self.most
+
+    def __str__(self) -> str:
+        if math.isinf(self.most):
+            return f"{'>' if self.strict else '≥'} {self.least:g}"
+        if math.isinf(self.least):
+            return f"{'<' if self.strict else '≤'} {self.most:g}"
+        return f"{self.least:g} to {self.most:g}"
+
+
+@dataclass(frozen=True)
+class Part:
+    """One number that a claim is about, or the note why there is none."""
+
+    method: str
+    side: Side
+    rival: str | None = None
+    at: At | None = None
+    """None: over all n of figure 3."""
+    value: float | None = None
+    low: float | None = None
+    high: float | None = None
+    counts: bool = True
+    """Whether the claim is about it; otherwise it is reported beside."""
+    note: str = ""
+
+    @property
+    def verdict(self) -> str:
+        """Holds, fails or undecided."""
+        if self.value is None or self.low is None or self.high is None:
+            return UNDECIDED
+        return self.side.verdict(self.low, self.high)
+
+    def to_dict(self) -> dict[str, Any]:
+        """As plain data; ends at infinity are None."""
+        flocks, n = self.at or (None, None)
+        return {
+            "method": self.method,
+            "rival": self.rival,
+            "n_flocks": flocks,
+            "cohesion": n,
+            "value": self.value,
+            "low": self.low,
+            "high": self.high,
+            "claimed": str(self.side),
+            "least": None if math.isinf(self.side.least) else self.side.least,
+            "most": None if math.isinf(self.side.most) else self.side.most,
+            "verdict": self.verdict,
+            "counts": self.counts,
+            "note": self.note,
+        }
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A claim with its parts."""
+
+    name: str
+    text: str
+    statistic: str
+    """What the numbers of its parts are."""
+    parts: tuple[Part, ...]
+
+    @property
+    def verdict(self) -> str:
+        """Fails if a part fails, holds if all hold; parts that do not count aside."""
+        verdicts = [part.verdict for part in self.parts if part.counts]
+        if FAILS in verdicts:
+            return FAILS
+        return HOLDS if verdicts and set(verdicts) == {HOLDS} else UNDECIDED
+
+    def to_dict(self) -> dict[str, Any]:
+        """As plain data."""
+        return {
+            "claim": self.name,
+            "text": self.text,
+            "statistic": self.statistic,
+            "verdict": self.verdict,
+            "parts": [part.to_dict() for part in self.parts],
+        }
+
+
+class Trials:
+    """The trials of every method at every point that has all of them.
+
+    A point that lacks a trial counts as not run: episodes that failed or are still to come may be the hard ones.
+
+    Args:
+        rows: of ``episodes.csv``; in any order.
+        seeds: of the trials.
+    """
+
+    def __init__(self, rows: Iterable[Row], seeds: Sequence[int]) -> None:
+        found: dict[tuple[str, At], dict[int, Row]] = {}
+        for row in rows:
+            found.setdefault((row["controller"], (row["n_flocks"], row["cohesion"])), {})[row["seed"]] = row
+        self._rows = {
+            key: [own[seed] for seed in seeds] for key, own in found.items() if all(seed in own for seed in seeds)
+        }
+        self.methods = tuple(dict.fromkeys(method for method, _ in self._rows))
+
+    def points(self, method: str, points: Sequence[At]) -> list[At]:
+        """Those of the points that the method has run."""
+        return [at for at in points if (method, at) in self._rows]
+
+    def values(self, method: str, at: At, metric: str) -> Floats:
+        """(n,) the metric of each trial, in the order of the seeds: so methods and points are paired by position."""
+        return np.array([float(row[metric]) for row in self._rows[method, at]])
+
+
+def judge(rows: Iterable[Row], seeds: Sequence[int], names: Sequence[str] | None = None) -> list[Claim]:
+    """What rows of the two experiments say to each claim.
+
+    Args:
+        rows: of ``episodes.csv``, of one scenario.
+        seeds: of the trials that a point must have; at least one.
+        names: of `CLAIMS`; all of them where it is left out.
+    """
+    trials = Trials(rows, seeds)
+    judged = []
+    for name in CLAIMS if names is None else names:
+        text, statistic, parts = CLAIMS[name]
+        judged.append(Claim(name, text, statistic, tuple(parts(trials))))
+    return judged
+
+
+def _delivered(trials: Trials, methods: Sequence[str], points: Sequence[At], side: Side) -> Iterator[Part]:
+    """c1 to c3: bounds of the mean."""
+
+    def measured(part: Part, at: At) -> Part:
+        return _with(part, trials.values(part.method, at, "in_goal_end"))
+
+    for method in methods:
+        yield from _at_each_point(trials, Part(method, side), points, measured)
+
+
+def _like_the_best(trials: Trials, points: Sequence[At], side: Side) -> Iterator[Part]:
+    """c4: paired difference to the heuristic that delivers most at the point; of equals the first."""
+
+    def measured(part: Part, at: At) -> Part:
+        missing = [name for name in HEURISTICS if not trials.points(name, [at])]
+        if missing:
+            return replace(part, note=f"not run: {', '.join(missing)}")
+        best = max(HEURISTICS, key=lambda name: trials.values(name, at, "in_goal_end").mean())
+        return _against(trials, part, best, at, "in_goal_end")
+
+    for method, counts in _learned(trials):
+        yield from _at_each_point(trials, Part(method, side, counts=counts), points, measured)
+
+
+def _shorter(trials: Trials, points: Sequence[At], side: Side, delivers: float) -> Iterator[Part]:
+    """c5: paired difference of paths, where the heuristic delivers enough on the mean."""
+    for method, counts in _learned(trials):
+        part = Part(method, side, counts=counts)
+        if not trials.points(method, points):
+            yield replace(part, note="not run")
+            continue
+        for rival in HEURISTICS:
+            there = trials.points(rival, points)
+            if not there:
+                yield replace(part, rival=rival, note=f"not run: {rival}")
+                continue
+            for at in points:
+                absent = [name for name in (method, rival) if not trials.points(name, [at])]
+                if absent:
+                    yield replace(part, rival=rival, at=at, note=f"not run: {', '.join(absent)}")
+                elif trials.values(rival, at, "in_goal_end").mean() >= delivers:
+                    yield _against(trials, part, rival, at, "path_length")
+
+
+def _follows_n(trials: Trials, metric: str, side: Side) -> Iterator[Part]:
+    """c6 and c7: rank correlation over the n of figure 3, bootstrapped over trials."""
+    beside = [name for name in trials.methods if name not in COUNTED]
+    n = np.array([n for _, n in COHESION], dtype=np.float64)
+    for method in (*COUNTED, *beside):
+        part = Part(method, side, counts=method in COUNTED)
+        there = trials.points(method, COHESION)
+        if len(there) == len(COHESION):
+            values = np.array([trials.values(method, at, metric) for at in COHESION])
+            value, low, high = correlation(n, values)
+            if math.isnan(value):
+                yield replace(part, note="the same at every n: no correlation is defined")
+            else:
+                yield replace(part, value=value, low=low, high=high)
+        elif part.counts or there:
+            missing = ", ".join(f"n = {at[1]}" for at in COHESION if at not in there)
+            yield replace(part, note=f"not run: {missing}" if there else "not run")
+
+
+def correlation(x: Floats, values: Floats) -> tuple[float, float, float]:
+    """Spearman correlation of the means of k series with ``x``, and its 95 % bootstrap percentile interval.
+
+    A resample takes the same trials of every series. One whose means are all equal says nothing about the order: it
+    counts as -1 for the low end and as 1 for the high one.
+
+    Args:
+        x: (k,).
+        values: (k, n) n trials of each series, paired.
+
+    Returns:
+        value (NaN where the k means are all equal), low, high.
+    """
+    tail = 50.0 * (1.0 - LEVEL)
+    value = float(spearman(x, _even(values.mean(axis=1))[:, None])[0])
+    resampled = spearman(x, _even(bootstrap(values)))
+    low = np.percentile(np.nan_to_num(resampled, nan=-1.0), tail)
+    high = np.percentile(np.nan_to_num(resampled, nan=1.0), 100.0 - tail)
+    return value, float(low), float(high)
+
+
+def spearman(x: Floats, y: Floats) -> Floats:
+    """Spearman's rank correlation, equal values sharing the average of their ranks.
+
+    Args:
+        x: (k,).
+        y: (k, m) m series.
+
+    Returns:
+        (m,) in [-1, 1]; NaN where x or the series is constant.
+    """
+    a = ranks(x[:, None])
+    b = ranks(y)
+    a, b = a - a.mean(axis=0), b - b.mean(axis=0)
+    size = np.sqrt((a**2).sum(axis=0) * (b**2).sum(axis=0))
+    return np.asarray(np.divide((a * b).sum(axis=0), size, out=np.full(y.shape[1], np.nan), where=size > 0))
+
+
+def ranks(values: Floats) -> Floats:
+    """(k, m) rank of each value in its column, from 1; equal values share the average of their ranks."""
+    less = (values[None] < values[:, None]).sum(axis=1)
+    equal = (values[None] == values[:, None]).sum(axis=1)
+    return np.asarray(less + 0.5 * (equal + 1.0))
+
+
+def _even(means: Floats) -> Floats:
+    """Means without their last bits: the same trials summed in another order must be equal."""
+    return np.asarray(np.round(means, 9))
+
+
+def _learned(trials: Trials) -> list[tuple[str, bool]]:
+    """The methods of c4 and c5, and whether they count."""
+    return [(name, True) for name in PROPOSED] + [("collie", False)] * ("collie" in trials.methods)
+
+
+def _at_each_point(
+    trials: Trials, part: Part, points: Sequence[At], measured: Callable[[Part, At], Part]
+) -> Iterator[Part]:
+    there = trials.points(part.method, points)
+    if not there:
+        yield replace(part, note="not run")
+        return
+    for at in points:
+        yield measured(replace(part, at=at), at) if at in there else replace(part, at=at, note="not run")
+
+
+def _against(trials: Trials, part: Part, rival: str, at: At, metric: str) -> Part:
+    difference = trials.values(part.method, at, metric) - trials.values(rival, at, metric)
+    return _with(replace(part, rival=rival, at=at), difference)
+
+
+def _with(part: Part, values: Floats) -> Part:
+    value, low, high = (float(number) for number in intervals(values[None])[0])
+    return replace(part, value=value, low=low, high=high)
+
+
+_MEAN = "mean delivered at the end [%]"
+CLAIMS: dict[str, tuple[str, str, Callable[[Trials], Iterable[Part]]]] = {
+    "c1": (
+        "wild and any deliver at least 95 % with one flock",
+        _MEAN,
+        lambda trials: _delivered(trials, PROPOSED, FLOCKS[:1], Side(least=95.0)),
+    ),
+    "c2": (
+        "wild and any deliver at least 80 % with each of 2 to 5 flocks",
+        _MEAN,
+        lambda trials: _delivered(trials, PROPOSED, FLOCKS[1:], Side(least=80.0)),
+    ),
+    "c3": (
+        "original delivers less than 50 % throughout",
+        _MEAN,
+        lambda trials: _delivered(trials, ("original",), EVERYWHERE, Side(most=50.0, strict=True)),
+    ),
+    "c4": (
+        "wild and any deliver at least as much as the best heuristic with 2 to 5 flocks and at n = 10",
+        "mean paired difference to the heuristic with the highest mean [percentage points]",
+        lambda trials: _like_the_best(trials, (*FLOCKS[1:], COHESION[0]), Side(least=-1.0)),
+    ),
+    "c5": (
+        "the paths of wild and any are 50 to 150 m shorter than of each heuristic that delivers at least 50 %",
+        "mean paired difference of path lengths [m]",
+        lambda trials: _shorter(trials, EVERYWHERE, Side(least=-150.0, most=-50.0), delivers=50.0),
+    ),
+    "c6": (
+        "every method delivers less as n falls",
+        "Spearman correlation of mean delivered with n",
+        lambda trials: _follows_n(trials, "in_goal_end", Side(least=0.0, strict=True)),
+    ),
+    "c7": (
+        "the paths of every method are longer for small n",
+        "Spearman correlation of mean path length with n",
+        lambda trials: _follows_n(trials, "path_length", Side(most=0.0, strict=True)),
+    ),
+    "c8": (
+        "wild levels off before any",
+        "difference of the training steps after which they level off",
+        lambda trials: [Part("wild", Side(most=0.0, strict=True), "any", note="needs the learning curves of figure 1")],
+    ),
+}
+"""By name: what is claimed, what the numbers of its parts are, and the parts."""

@@ -1,0 +1,106 @@
+"""Markdown pages of a reproduction, from what its CSV and JSON files hold: they can be made again and compared."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from shepherd_phys.controllers.claims import EXPERIMENTS
+
+MEASURES = {"in_goal_end": ("Sheep in the goal at the end, %", ".1f"), "path_length": ("Path of a shepherd, m", ".0f")}
+SHOWN = {"n_flocks": "flocks: {}", "cohesion": "n = {}"}
+CLAIMED_TRIALS = 100
+"""The paper's trials a point."""
+
+
+def figure_page(name: str, summary: Sequence[Mapping[str, Any]]) -> str:
+    """The figure with its two tables.
+
+    Args:
+        name: of `EXPERIMENTS`.
+        summary: rows of its CSV.
+    """
+    experiment = EXPERIMENTS[name]
+    fixed = "cohesion" if experiment.varied == "n_flocks" else "n_flocks"
+    words = {**SHOWN, "n_shepherds": "{} shepherds", "n_sheep": "{} sheep", "trials": "{} trials a point"}
+    same = [
+        words[label].format(_range(row[label] for row in summary))
+        for label in (fixed, "n_shepherds", "n_sheep", "trials")
+    ]
+    columns = sorted({row[experiment.varied] for row in summary})
+    methods = list(dict.fromkeys(row["controller"] for row in summary))
+    cells = {(row["controller"], row[experiment.varied]): row for row in summary}
+    lines = [
+        f"# {experiment.title}",
+        "",
+        f"![{experiment.title}; sheep delivered and path length]({name}.png)",
+        "",
+        f"{', '.join(same)}; mean [95 % bootstrap interval]; made by `shepherd-phys reproduce`; "
+        "claims.json has seed and version.",
+    ]
+    for metric, (title, digits) in MEASURES.items():
+        head = ["controller", *(SHOWN[experiment.varied].format(column) for column in columns)]
+        lines += ["", f"**{title}**", "", _line(head), _line(["---", *["---:"] * len(columns)])]
+        for method in methods:
+            rows = [cells.get((method, column)) for column in columns]
+            shown = ["" if row is None else _interval(row, f"{metric}_mean", f"{metric}_", digits) for row in rows]
+            lines.append(_line([f"`{method}`", *shown]))
+    return "\n".join([*lines, ""])
+
+
+def claims_page(report: Mapping[str, Any]) -> str:
+    """The claims: verdicts, then what each rests on.
+
+    Args:
+        report: what ``claims.json`` holds.
+    """
+    lines = [
+        "# The paper's claims",
+        "",
+        f"{report['trials']} trials a point on root seed {report['seed']}, shepherd_phys {report['version']}; "
+        "values with 95 % bootstrap intervals.",
+        *few_trials(report),
+        "",
+        _line(["claim", "says", "verdict"]),
+        _line(["---"] * 3),
+    ]
+    for claim in report["claims"]:
+        lines.append(_line([claim["claim"], claim["text"], f"**{claim['verdict']}**"]))
+    for claim in report["claims"]:
+        lines += ["", f"## {claim['claim']}: {claim['text']}", "", f"{claim['statistic']}; {claim['verdict']}.", ""]
+        lines += [_line(PART_HEAD), _line(["---", "---", "---:", "---", "---"])]
+        lines += [_line(part_cells(part)) for part in claim["parts"]]
+    return "\n".join([*lines, ""])
+
+
+def few_trials(report: Mapping[str, Any]) -> list[str]:
+    """A warning where the claims are judged on fewer trials than they are stated for."""
+    if report["trials"] >= CLAIMED_TRIALS:
+        return []
+    return [f"The claims are stated for {CLAIMED_TRIALS} trials: verdicts on {report['trials']} are a rehearsal."]
+
+
+PART_HEAD = ("method", "at", "value [95 %]", "claimed", "verdict")
+
+
+def part_cells(part: Mapping[str, Any]) -> tuple[str, ...]:
+    """A part of a claim as cells under `PART_HEAD`."""
+    method = part["method"] if part["rival"] is None else f"{part['method']} - {part['rival']}"
+    at = "" if part["n_flocks"] is None else f"flocks: {part['n_flocks']}, n = {part['cohesion']}"
+    digits = ".2f" if 0 in (part["least"], part["most"]) else ".1f"  # a correlation, or percent and metres
+    value = part["note"] if part["value"] is None else _interval(part, "value", "", digits)
+    verdict = part["verdict"] if part["counts"] else f"({part['verdict']}, beside)"
+    return method, at, value, part["claimed"], verdict
+
+
+def _interval(row: Mapping[str, Any], value: str, prefix: str, digits: str) -> str:
+    return f"{row[value]:{digits}} [{row[f'{prefix}low']:{digits}}, {row[f'{prefix}high']:{digits}}]"
+
+
+def _range(values: Iterable[Any]) -> str:
+    found = sorted(set(values))
+    return str(found[0]) if len(found) == 1 else f"{found[0]} to {found[-1]}"
+
+
+def _line(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"

@@ -1,0 +1,248 @@
+"""``shepherd-phys reproduce``: the paper's experiments, their figures, and what they say to its claims."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, TextIO
+
+import tyro
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from shepherd_phys import __version__, campaign
+from shepherd_phys.campaign import CampaignError, Ledger, Outcome, Task, remove, write_bytes, write_csv
+from shepherd_phys.controllers import CONTROLLERS
+from shepherd_phys.controllers.claims import EXPERIMENTS, HEURISTICS, LEARNED, LITERAL, judge
+from shepherd_phys.controllers.evaluation import COLUMNS, ControllerError, trial_seed
+from shepherd_phys.controllers.summary import summarise, summary_columns
+from shepherd_phys.settings import SettingsError
+
+from .command import at_least, cpu_count, fail, flag, parsed, progress_bar, workforce
+from .evaluate import print_table, ready
+from .pages import PART_HEAD, claims_page, few_trials, figure_page, part_cells
+from .points import episode, points, table, tasks
+
+PROG = "shepherd-phys reproduce"
+SCENARIO = "paper"
+CHOICES = (*EXPERIMENTS, "all")
+
+
+@dataclass(frozen=True)
+class Reproduce:
+    """Run the paper's experiments with every method that there is, draw its figures, and judge its claims.
+
+    Writes into the folder --out, for each figure, its CSV, Markdown tables and drawing; claims.json and claims.md;
+    episodes.csv; and a ledger that lets a stopped run continue: give the same command again.
+    """
+
+    figure: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="|".join(CHOICES))]
+    """Which of the paper's figures; a point that two of them share is run once."""
+    literal: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Add the heuristics as published: strombom-literal, pierson-reconstructed, elfiqi-literal."""
+    controllers: Annotated[tuple[str, ...], flag("NAME ..", "all tuned heuristics and shipped policies")] = ()
+    """Only these, by name or module:Name of your own; claims on others stay undecided."""
+    trials: Annotated[int, flag("T")] = 100
+    """Episodes a point."""
+    seed: Annotated[int, flag("S")] = 20_000
+    """Root seed: trial i has a seed derived from S and i alone, the same for every controller and point."""
+    workers: Annotated[int, flag("W")] = cpu_count()
+    """Worker processes; the results do not depend on it."""
+    scheduler: Annotated[str | None, flag("ADDRESS", "")] = None
+    """Instead of --workers: the scheduler of a Dask cluster, e.g. tcp://10.0.0.1:8786."""
+    timeout: Annotated[float, flag("SECONDS")] = 600.0
+    """An episode that takes longer counts as hung."""
+    out: Annotated[Path, flag("DIR")] = Path("results/reproduce")
+    """Folder for tables, figures and ledger; an unfinished run in it is continued."""
+    gather: Annotated[tuple[Path, ...], flag("DIR ..", "")] = ()
+    """Folders of other campaigns: episodes that they have are taken over and not run."""
+    json: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Print one JSON object, the rows of each figure and the claims, and nothing else, on standard output."""
+
+
+LEAST = {"trials": 1, "seed": 0, "workers": 1}
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run the command; the exit status: 0, 1 if episodes failed, 2 for a mistake of the user, 130 for Ctrl-C."""
+    try:
+        options = read_options(argv)
+    except SettingsError as error:
+        return fail(PROG, error, 2)
+    out = sys.stdout
+    with contextlib.redirect_stdout(sys.stderr):  # a user's classes may print wherever they are touched
+        return _main(options, out)
+
+
+def _main(options: Reproduce, out: TextIO) -> int:
+    asked = list(EXPERIMENTS) if options.figure == "all" else [options.figure]
+    methods = roster(options.controllers, options.literal)
+    seeds = [trial_seed(options.seed, trial) for trial in range(options.trials)]
+    try:
+        check_drawing()
+        todo, everything = work(asked, methods, seeds), work(list(EXPERIMENTS), methods, seeds)
+    except (SettingsError, ControllerError) as error:
+        return fail(PROG, error, 2)
+    with progress_bar() as report:
+        try:
+            ledger = ready(options.out, todo, options.gather)
+        except (SettingsError, CampaignError) as error:
+            return fail(PROG, error, 2)
+        with ledger:
+            try:
+                outcome = campaign.run(
+                    todo,
+                    episode,
+                    workers=workforce(PROG, options.workers, options.scheduler),
+                    ledger=ledger,
+                    timeout=options.timeout,
+                    report=report,
+                )
+                rows = table(everything, kept(ledger, everything))
+                summaries = {name: summary_of(name, rows, methods) for name in asked}
+                claims = {
+                    "trials": options.trials,
+                    "seed": options.seed,
+                    "version": __version__,
+                    "claims": [claim.to_dict() for claim in judge(rows, seeds)],
+                }
+                paths = write_files(options.out, rows, summaries, claims)
+            except CampaignError as error:
+                return fail(PROG, error, 1)
+            except KeyboardInterrupt:
+                return fail(
+                    PROG, f"stopped; what was finished is kept in {ledger.path}: the same command continues", 130
+                )
+    if options.json:
+        print(json.dumps({**summaries, "claims": claims}, allow_nan=False, indent=1), file=out)
+    else:
+        for summary in summaries.values():
+            print_table(summary, out)
+        print_claims(claims, out)
+    for path in paths:
+        print(path, file=sys.stderr if options.json else out)
+    for failure in outcome.failures:
+        print(f"{PROG}: no result in {failure.attempts} attempts: {failure}", file=sys.stderr)
+    return 1 if outcome.failures else 0
+
+
+def roster(controllers: Sequence[str], literal: bool) -> list[str]:
+    """The methods to compare: those asked for, or the tuned heuristics and the policies as far as they exist."""
+    known = [name for name in (*HEURISTICS, *LEARNED) if name in CONTROLLERS]
+    return list(dict.fromkeys([*(controllers or known), *(LITERAL if literal else ())]))
+
+
+def work(names: Sequence[str], controllers: Sequence[str], seeds: Sequence[int]) -> list[Task]:
+    """The tasks of some experiments; a point that two of them share comes once.
+
+    Raises:
+        SettingsError, ControllerError: a controller is unknown or none.
+    """
+    grid = [
+        point
+        for experiment in (EXPERIMENTS[name] for name in names)
+        for point in points(
+            controllers=controllers, scenario=SCENARIO, flocks=experiment.flocks, cohesion=experiment.cohesion
+        )
+    ]
+    return list({task.key: task for task in tasks(grid, seeds)}.values())
+
+
+def kept(ledger: Ledger, tasks: Sequence[Task]) -> Outcome:
+    """What the ledger holds of the tasks, of earlier runs for another figure too."""
+    rows = ledger.rows(task.settings_hash for task in tasks)
+    return Outcome(rows=[rows.get(task.key) for task in tasks], failures=[], computed=0)
+
+
+def summary_of(name: str, rows: Sequence[Mapping[str, Any]], methods: Sequence[str]) -> list[dict[str, Any]]:
+    """The rows of an experiment's CSV: method by method."""
+    there = EXPERIMENTS[name].points
+    hashes = {(row["controller"], row["n_flocks"], row["cohesion"]): row["settings_hash"] for row in rows}
+    summary = [
+        {**row, "settings_hash": hashes[row["controller"], row["n_flocks"], row["cohesion"]]}
+        for row in summarise(row for row in rows if (row["n_flocks"], row["cohesion"]) in there)
+    ]
+    return sorted(summary, key=lambda row: (methods.index(row["controller"]), row["n_flocks"], row["cohesion"]))
+
+
+def check_drawing() -> None:
+    """Find out before hours of computing whether figures can be drawn.
+
+    Raises:
+        SettingsError: matplotlib is missing.
+    """
+    try:
+        importlib.import_module("matplotlib")
+    except ImportError as error:
+        raise SettingsError(f"the figures need matplotlib: pip install 'shepherd-phys[analysis]' ({error})") from None
+
+
+def write_files(
+    folder: Path,
+    rows: Sequence[Mapping[str, Any]],
+    summaries: Mapping[str, Sequence[Mapping[str, Any]]],
+    claims: Mapping[str, Any],
+) -> list[Path]:
+    """Write every table, page and figure; their paths.
+
+    Raises:
+        CampaignError: one cannot be written. It is as it was before.
+    """
+    from .figures import draw
+
+    episodes = folder / "episodes.csv"
+    write_csv(episodes, COLUMNS, rows)
+    paths = [episodes]
+    for name, summary in summaries.items():
+        own = [folder / f"{name}.{kind}" for kind in ("csv", "md", "png")]
+        if not summary:  # every episode failed, which is reported; what an earlier run drew must not stand for it
+            remove(own)
+            continue
+        write_csv(own[0], (*summary_columns(), "settings_hash"), summary)
+        write_bytes(own[1], figure_page(name, summary).encode())
+        write_bytes(own[2], draw(EXPERIMENTS[name], summary))
+        paths += own
+    text = json.dumps(claims, allow_nan=False, indent=1, ensure_ascii=False)
+    write_bytes(folder / "claims.json", f"{text}\n".encode())
+    write_bytes(folder / "claims.md", claims_page(claims).encode())
+    return [*paths, folder / "claims.json", folder / "claims.md"]
+
+
+def print_claims(claims: Mapping[str, Any], out: TextIO) -> None:
+    """Print what each claim rests on, then the verdicts."""
+    parts = Table(*("claim", *PART_HEAD), box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    verdicts = Table("claim", "says", "verdict", box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    for claim in claims["claims"]:
+        for part in claim["parts"]:
+            parts.add_row(claim["claim"], *part_cells(part))
+        verdicts.add_row(claim["claim"], claim["text"], claim["verdict"])
+    console = Console(file=out, markup=False, highlight=False)
+    if not console.is_terminal:
+        console.width = 200  # a file has no edge to wrap at
+    console.print(parts)
+    console.print(verdicts)
+    for line in few_trials(claims):
+        console.print(line)
+
+
+def read_options(argv: Sequence[str]) -> Reproduce:
+    """The options from the command line, checked.
+
+    Raises:
+        SettingsError: something is unknown or impossible.
+        SystemExit: after ``--help``.
+    """
+    options, given = parsed(Reproduce, PROG, argv)
+    if options.figure not in CHOICES:
+        raise SettingsError(f"figure: {options.figure!r} is unknown; there are {', '.join(CHOICES)}")
+    for name in ("controllers", "gather"):
+        if name in given and not getattr(options, name):
+            raise SettingsError(f"--{name}: needs at least one value")
+    at_least(vars(options), LEAST)
+    return options
