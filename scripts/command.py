@@ -23,7 +23,7 @@ from shepherd_phys.settings import SettingsError
 
 LOG_SECONDS = 30.0
 """Progress is a line so often where standard error is no terminal [s]."""
-NUMBERS = ("sheep", "trials", "seed", "workers", "rounds", "candidates")
+NUMBERS = ("sheep", "trials", "seed", "workers", "rounds", "candidates", "budget")
 WANTED = {
     **dict.fromkeys(("flocks", "cohesion", "shepherds"), "whole numbers"),
     **dict.fromkeys(NUMBERS, "a whole number"),
@@ -133,7 +133,7 @@ def progress_bar() -> Iterator[Any]:
         pace = "starting"
         if first is not None and ended > first[1]:
             rate = (ended - first[1]) / (time.monotonic() - first[0])
-            pace = f"{rate:.2f} episodes/s, {_clock((now.total - ended) / rate)} left"
+            pace = f"{rate:.2f} episodes/s, {clock((now.total - ended) / rate)} left"
         if now.failed:
             pace += f", {now.failed} failed"
         bar.update(shown, total=now.total, completed=ended, pace=pace)
@@ -145,7 +145,8 @@ def progress_bar() -> Iterator[Any]:
         yield report
 
 
-def _clock(seconds: float) -> str:
+def clock(seconds: float) -> str:
+    """Hours, minutes and seconds."""
     minutes, seconds = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{seconds:02d}"

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
-import io
 import math
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,7 +20,7 @@ from shepherd_phys.learning.folder import BEST, CURVE, POLICY, PRESET, VALIDATIO
 from shepherd_phys.learning.preset import Preset, load_preset
 from shepherd_phys.settings import SettingsError
 
-from .evaluate import LOG_SECONDS, _clock, _flag, _one_line, cpu_count
+from .command import LOG_SECONDS, at_least, clock, cpu_count, fail, flag, parsed
 
 PROG = "shepherd-phys train"
 LIBRARIES = ("torch", "stable_baselines3", "tensorboard")
@@ -36,19 +35,19 @@ class Train:
     A run that was stopped or killed goes on with --resume, exactly as if nothing had happened.
     """
 
-    preset: Annotated[str, _flag("NAME|FILE")] = "fast"
+    preset: Annotated[str, flag("NAME|FILE")] = "fast"
     """How to train: fast, paper or collie, or a TOML file of your own."""
-    reward: Annotated[str | None, _flag("NAME", "the preset's")] = None
+    reward: Annotated[str | None, flag("NAME", "the preset's")] = None
     """Reward scheme."""
-    seed: Annotated[int | None, _flag("S", "the preset's")] = None
+    seed: Annotated[int | None, flag("S", "the preset's")] = None
     """Root of everything random; 1,000,000 and up is meant for training."""
-    budget: Annotated[int | None, _flag("N", "the preset's")] = None
+    budget: Annotated[int | None, flag("N", "the preset's")] = None
     """Shepherd-steps (control steps times shepherds) to train for."""
-    init: Annotated[str | None, _flag("NAME|FILE", "the preset's")] = None
+    init: Annotated[str | None, flag("NAME|FILE", "the preset's")] = None
     """Policy to start from: a shipped one's name or a .json file."""
-    workers: Annotated[int, _flag("W")] = cpu_count()
+    workers: Annotated[int, flag("W")] = cpu_count()
     """Processes for the worlds; the results do not depend on it."""
-    out: Annotated[Path | None, _flag("DIR", "runs/PRESET-REWARD-SEED")] = None
+    out: Annotated[Path | None, flag("DIR", "runs/PRESET-REWARD-SEED")] = None
     """Folder of the run."""
     resume: tyro.conf.FlagCreatePairsOff[bool] = False
     """Go on with the run in --out."""
@@ -61,13 +60,14 @@ FROM_PRESET = ("reward", "seed", "budget", "init")
 def main(argv: Sequence[str]) -> int:
     """Run the command; the exit status: 0, 1 if training had to stop, 2 for a mistake of the user, 130 for Ctrl-C."""
     try:
-        options, flags = read_options(argv)
+        options, flags = parsed(Train, PROG, argv)
+        at_least(vars(options), {"seed": 0, "budget": 1, "workers": 1})
         missing = [name for name in LIBRARIES if importlib.util.find_spec(name) is None]
         if missing:
             raise SettingsError(f"{', '.join(missing)} is missing: pip install 'shepherd-phys[train]'")
         folder, preset = prepare(options, flags)
     except SettingsError as error:
-        return _fail(error, 2)
+        return fail(PROG, error, 2)
     # imported only now: torch takes seconds to load, which no mistake in the flags should cost
     from shepherd_phys.envs.team import WorkerError
     from shepherd_phys.learning.checkpoints import CheckpointError
@@ -84,40 +84,17 @@ def main(argv: Sequence[str]) -> int:
         try:
             best = train(folder, options.workers, report)
         except SettingsError as error:
-            return _fail(error, 2)
+            return fail(PROG, error, 2)
         except (CheckpointError, TrainingError, ValidationError, WorkerError, WorkersError, OSError) as error:
-            return _fail(error, 1)
+            return fail(PROG, error, 1)
         except KeyboardInterrupt:
-            return _fail(f"stopped: --resume --out {folder} goes on from the last checkpoint", 130)
+            return fail(PROG, f"stopped: --resume --out {folder} goes on from the last checkpoint", 130)
     if best is not None:
         print(f"best policy: score {best.score:.1f} after {best.shepherd_steps:,} shepherd-steps")
     for name in (BEST, POLICY, CURVE, VALIDATION):
         if (folder / name).exists():
             print(folder / name)
     return 0
-
-
-def read_options(argv: Sequence[str]) -> tuple[Train, set[str]]:
-    """The options from the command line, and which of them were given.
-
-    Raises:
-        SettingsError: something is unknown or impossible.
-        SystemExit: after ``--help``.
-    """
-    said = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(said):
-            options = tyro.cli(Train, prog=PROG, args=list(argv))
-    except SystemExit as end:
-        if not end.code:
-            raise
-        raise SettingsError(f"{_one_line(said.getvalue())} (see {PROG} --help)") from None
-    for name, least in {"seed": 0, "budget": 1, "workers": 1}.items():
-        value = getattr(options, name)
-        if value is not None and value < least:
-            raise SettingsError(f"{name}: {value} is impossible; it must be at least {least}")
-    given = {f.name for f in fields(Train) if any(a == f"--{f.name}" or a.startswith(f"--{f.name}=") for a in argv)}
-    return options, given
 
 
 def prepare(options: Train, given: set[str]) -> tuple[Path, Preset]:
@@ -143,6 +120,7 @@ def prepare(options: Train, given: set[str]) -> tuple[Path, Preset]:
         return options.out, preset
     preset = load_preset(options.preset).but(**changes)
     folder = options.out or Path("runs") / f"{Path(options.preset).stem}-{preset.reward}-{preset.seed}"
+    preset.start()  # before a folder is made that the next attempt would find
     begin(folder, preset)
     return folder, preset
 
@@ -170,7 +148,7 @@ def progress_bar() -> Iterator[Any]:
             )
             console.print(f"validation at {steps}: {points}", soft_wrap=True)
             return
-        left = _clock(max(0, now.budget - now.shepherd_steps) / max(now.rate, 1e-9))
+        left = clock(max(0, now.budget - now.shepherd_steps) / max(now.rate, 1e-9))
         told = f"{now.rate:,.0f} shepherd-steps/s, {left} left"
         if math.isfinite(now.measures["episode_reward"]):
             told += f", reward {now.measures['episode_reward']:.2f}, {now.measures['in_goal_end']:.0f} % in"
@@ -181,8 +159,3 @@ def progress_bar() -> Iterator[Any]:
 
     with bar:
         yield report
-
-
-def _fail(error: object, status: int) -> int:
-    print(f"{PROG}: {' '.join(str(error).split())}", file=sys.stderr)
-    return status
