@@ -45,6 +45,7 @@ class Policy:
         # in the goal frame each shepherd's roll depends on its last one, which is the controller's to remember: the env
         # gives all beams in the world frame
         self._rolls = spec.lidar.frame == "goal"
+        self._observed, self._interval = spec.lidar, spec.action.interval
         self._lidar = spec.lidar.but(frame="world", sectors=None) if self._rolls else spec.lidar
         self._directions = beam_directions(spec.lidar.beams)
         self._offset: NDArray[np.int64] | None = None
@@ -78,10 +79,9 @@ class Policy:
         if self._offset is None:
             self._offset = np.zeros(n, np.int64)
         if self._rolls:
-            observation, self._offset = observe(observation.reshape(n, *self._frames), self._offset, self.spec.lidar)
-        if self._action is not None and state.step % self.spec.action.interval:
-            return self._action.copy()
-        self._action = _wanted(self._actor(observation), self._offset, self._directions)
+            observation, self._offset = observe(observation.reshape(n, *self._frames), self._offset, self._observed)
+        if self._action is None or state.step % self._interval == 0:
+            self._action = _wanted(self._actor(observation), self._offset, self._directions)
         return self._action.copy()
 
     def to_dict(self) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from shepherd_phys.settings import SettingsError
 
 LOG_SECONDS = 30.0
 """Progress is a line so often where standard error is no terminal [s]."""
-NUMBERS = ("sheep", "trials", "seed", "workers", "rounds", "candidates")
+NUMBERS = ("sheep", "trials", "seed", "workers", "rounds", "candidates", "budget")
 WANTED = {
     **dict.fromkeys(("flocks", "cohesion", "shepherds"), "whole numbers"),
     **dict.fromkeys(NUMBERS, "a whole number"),

@@ -11,8 +11,8 @@ from shepherd_phys import __version__
 
 COMMANDS = {
     "evaluate": "run controllers over a grid of experiments and write the tables",
-    "tune": "search the lengths of a heuristic team on tuning seeds",
     "train": "learn a policy, with checkpoints from which a stopped run goes on",
+    "tune": "search the lengths of a heuristic team on tuning seeds",
     "benchmark": "measure how fast the simulator is on this machine",
     "reproduce": "run the paper's experiments, draw its figures and judge its claims",
 }

@@ -60,7 +60,8 @@ FROM_PRESET = ("reward", "seed", "budget", "init")
 def main(argv: Sequence[str]) -> int:
     """Run the command; the exit status: 0, 1 if training had to stop, 2 for a mistake of the user, 130 for Ctrl-C."""
     try:
-        options, flags = read_options(argv)
+        options, flags = parsed(Train, PROG, argv)
+        at_least(vars(options), {"seed": 0, "budget": 1, "workers": 1})
         missing = [name for name in LIBRARIES if importlib.util.find_spec(name) is None]
         if missing:
             raise SettingsError(f"{', '.join(missing)} is missing: pip install 'shepherd-phys[train]'")
@@ -96,18 +97,6 @@ def main(argv: Sequence[str]) -> int:
     return 0
 
 
-def read_options(argv: Sequence[str]) -> tuple[Train, set[str]]:
-    """The options from the command line, and which of them were given.
-
-    Raises:
-        SettingsError: something is unknown or impossible.
-        SystemExit: after ``--help``.
-    """
-    options, given = parsed(Train, PROG, argv)
-    at_least(vars(options), {"seed": 0, "budget": 1, "workers": 1})
-    return options, given
-
-
 def prepare(options: Train, given: set[str]) -> tuple[Path, Preset]:
     """The folder of the run and its preset; a new run's folder is made.
 
@@ -131,6 +120,7 @@ def prepare(options: Train, given: set[str]) -> tuple[Path, Preset]:
         return options.out, preset
     preset = load_preset(options.preset).but(**changes)
     folder = options.out or Path("runs") / f"{Path(options.preset).stem}-{preset.reward}-{preset.seed}"
+    preset.start()  # before a folder is made that the next attempt would find
     begin(folder, preset)
     return folder, preset
 

@@ -63,13 +63,8 @@ class Dask:
 
     def end(self):
         for process in self.processes:
-            process.terminate()
-        for process in self.processes:
-            try:
-                process.wait(20)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+            process.kill()  # the worker of a nanny ends with it; a polite end waits for others that end, too
+            process.wait()
 
 
 @pytest.fixture

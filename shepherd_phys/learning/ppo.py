@@ -15,12 +15,10 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
 
-from shepherd_phys.controllers.learned import POLICIES, Policy, load_policy
 from shepherd_phys.envs.team import TeamVecEnv
 from shepherd_phys.learning.export import _actor, load_actor
 from shepherd_phys.learning.network import TeamPolicy
 from shepherd_phys.learning.preset import Preset
-from shepherd_phys.settings import SettingsError
 
 Array = NDArray[Any]
 
@@ -47,7 +45,7 @@ class Learner:
 
     def __init__(self, preset: Preset, n_workers: int = 0, logger: Logger | None = None, fresh: bool = True) -> None:
         self.preset = preset
-        start = _start(preset) if fresh else None
+        start = preset.start() if fresh else None
         torch.set_num_threads(preset.threads)
         ppo = preset.ppo
         self.env = TeamVecEnv(
@@ -198,23 +196,6 @@ class Learner:
     def close(self) -> None:
         """End the worlds' processes."""
         self.env.close()
-
-
-def _start(preset: Preset) -> Policy | None:
-    """The policy to start from.
-
-    Raises:
-        SettingsError: it cannot be read, or is not of the preset's lidar and network.
-    """
-    name = preset.init
-    if name is None:
-        return None
-    policy = POLICIES[name]() if name in POLICIES else load_policy(name)
-    for part in ("lidar", "network"):
-        theirs, ours = getattr(policy.spec, part), getattr(preset, part)
-        if theirs != ours:
-            raise SettingsError(f"init: {name} has another {part} than the preset: {theirs}, not {ours}")
-    return policy
 
 
 LOGGED = (

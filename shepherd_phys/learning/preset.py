@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
+from shepherd_phys.controllers.learned import POLICIES, Policy, load_policy
 from shepherd_phys.controllers.network import SectorNetwork
 from shepherd_phys.envs.mixture import Mixture
 from shepherd_phys.envs.rewards import SCHEMES, Effort, Term
@@ -169,6 +170,24 @@ class Preset(Settings):
         if self.effort:
             scheme["effort"] = (-self.effort, Effort())
         return scheme
+
+    def start(self) -> Policy | None:
+        """The policy to start from, if there is one.
+
+        Raises:
+            SettingsError: it cannot be read, or is not of the preset's lidar and network.
+        """
+        name = self.init
+        if name is None:
+            return None
+        if name not in POLICIES and not name.endswith(".json"):
+            raise SettingsError(f"init: {name!r} is neither a .json file nor a shipped policy ({', '.join(POLICIES)})")
+        policy = POLICIES[name]() if name in POLICIES else load_policy(name)
+        for part in ("lidar", "network"):
+            theirs, ours = getattr(policy.spec, part), getattr(self, part)
+            if theirs != ours:
+                raise SettingsError(f"init: {name} has another {part} than the preset: {theirs}, not {ours}")
+        return policy
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> Preset:
