@@ -1,16 +1,8 @@
-"""The team's vector env: the same numbers as ShepherdingEnv, right ends, reproducible, and no worker can hang it."""
-
-import inspect
-import os
-import signal
-import subprocess
-import sys
-import threading
+"""The team's vector env: the same numbers as ShepherdingEnv, right ends of episodes, reproducible, fit for SB3."""
 
 import numpy as np
 import pytest
-from scenes import arranged
-from team_terms import SMALL, Constant, Fails, Slow, Unreadable, alternating, no_scenario
+from team_scenes import SMALL, Constant, alternating, episode_seeds, no_scenario, view
 
 pytest.importorskip("stable_baselines3")
 
@@ -21,10 +13,8 @@ from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 from shepherd_phys.envs import WILD, ShepherdingEnv
 from shepherd_phys.envs import _critic as critic
-from shepherd_phys.envs._team_crew import shared_out
-from shepherd_phys.envs.mixture import Mixture
 from shepherd_phys.envs.rewards import Effort
-from shepherd_phys.envs.team import TeamVecEnv, WorkerError
+from shepherd_phys.envs.team import TeamVecEnv
 from shepherd_phys.lidar import Lidar, turn
 from shepherd_phys.obstacles import Pillar
 from shepherd_phys.scenario import SCENARIOS
@@ -36,14 +26,6 @@ SCHEME = {**WILD, "effort": (-0.5, Effort())}
 
 def actions(env, rng):
     return rng.uniform(-1, 1, (env.num_envs, 2)).astype(np.float32)
-
-
-def episode_seeds(root, number, world):
-    """The seeds of a world's episodes."""
-    seeds, *_ = np.random.SeedSequence(root, spawn_key=(number, world)).spawn(3)
-    generator = np.random.default_rng(seeds)
-    while True:
-        yield int(generator.integers(2**63))
 
 
 def followed(n_steps=30, root=5, **arguments):
@@ -67,6 +49,7 @@ def followed(n_steps=30, root=5, **arguments):
 
 
 # ------------------------------------------------------------ the same numbers as ShepherdingEnv
+
 
 LIDARS = {
     "world frame": COMPACT,
@@ -174,6 +157,20 @@ def test_obstacles_are_observed_where_the_scenario_has_some():
     assert env.reset()["lidar"].reshape(2, 3, 4, 512)[:, :, 3].any()
 
 
+def test_the_critic_sees_the_frame_of_the_observation_and_no_clock():
+    env = TeamVecEnv(SMALL, (3,), lidar=Lidar(sectors=64, frame="goal"), critic="world", random_clocks=False)
+    observation = env.reset()
+    for k in range(10):
+        (state, *_), (offset, *_) = env.get_attr("state"), env.get_attr("beam_offset")
+        assert observation["critic"].tobytes() == view(state, 2 * np.pi / 512 * offset).tobytes()
+        if k < 9:
+            assert view(state.but(step=5, time=1.0), [0.0] * 3).tobytes() == view(state, [0.0] * 3).tobytes()
+        observation, *_ = env.step(np.full((3, 2), 0.7))
+    away = -observation["critic"][:, 96]  # the goal lies straight ahead of everybody outside it
+    assert (away > 0).all() and np.abs(observation["critic"][:, 97]).max() < 0.03
+    assert env.observation_space.contains({name: part[0] for name, part in observation.items()})
+
+
 # ------------------------------------------------------------ ends of episodes
 
 
@@ -265,9 +262,6 @@ def test_returns_of_a_constant_reward_are_its_known_value_across_time_outs():
     ends = rollout(model)
     assert sum(dones.sum() for dones, _ in ends) >= 9
     assert model.rollout_buffer.returns == pytest.approx(np.full((40, 3), 10.0), rel=1e-5)
-    for _, infos in ends:
-        for info in infos:
-            info.pop("TimeLimit.truncated", None)
 
 
 # ------------------------------------------------------------ randomness
@@ -354,21 +348,6 @@ def test_seeds_given_by_ppo_are_the_root():
     assert len(roots) == 3
 
 
-def test_mixture_draws_within_its_ranges_and_from_its_stream():
-    mixture = Mixture(base=SMALL, n_flocks=(1, 3), n_neighbours=(2, 5))
-    drawn = [mixture(np.random.default_rng(k), 0) for k in range(60)]
-    assert {s.n_flocks for s in drawn} == {1, 2, 3}
-    assert {s.flock.n_neighbours for s in drawn} == {2, 3, 4, 5}
-    assert all(s.but(n_flocks=2, flock=SMALL.flock) == SMALL for s in drawn)
-    assert mixture(np.random.default_rng(7), 0) == mixture(np.random.default_rng(7), 5)
-    kept = mixture.but(n_neighbours=None)(np.random.default_rng(0), 0)
-    assert kept.flock == SMALL.flock
-    with pytest.raises(SettingsError, match="n_flocks may be 9, more than there are sheep"):
-        Mixture(base=SMALL, n_flocks=(1, 9))
-    with pytest.raises(SettingsError, match="the smaller number comes first"):
-        Mixture(n_flocks=(3, 1))
-
-
 def test_an_episode_may_be_another_scenario_than_the_last():
     env = TeamVecEnv(alternating, (2,), lidar=COMPACT, random_clocks=False)
     env.reset()
@@ -379,65 +358,6 @@ def test_an_episode_may_be_another_scenario_than_the_last():
         _, _, dones, infos = env.step(np.zeros((2, 2)))
         assert not dones[0] or infos[0]["control_steps"] == scenario.n_steps
     assert len(found) >= 4
-
-
-# ------------------------------------------------------------ what the critic sees
-
-
-def view(state, angle):
-    seen = np.full((state.n_shepherds, critic.N_NUMBERS), np.nan, np.float32)
-    critic.whole_world(state, np.array(angle, float), seen)
-    return seen
-
-
-def test_the_critics_view_by_hand():
-    # one sheep in the goal to the east, one 6 m outside it to the north, one between two rings and two bearings
-    between = (2.5 + 4.75) * np.array([np.cos(np.pi / 8), np.sin(np.pi / 8)])
-    state = arranged([[1.0, 0.0], [0.0, 8.5], between], [[-12.5, 0.0], [0.0, -3.5]])
-    seen = view(state, [0.0, np.pi / 2])
-    sheep = seen[:, :64].reshape(2, 8, 8) * 3
-    expected = np.zeros((8, 8))  # rings by bearings
-    expected[0, 0] = 1.0
-    expected[3, 2] = 1.0
-    expected[2, :2] += 0.25
-    expected[3, :2] += 0.25
-    assert sheep[0] == pytest.approx(expected, abs=1e-6)
-    assert sheep[1] == pytest.approx(np.roll(expected, -2, axis=1), abs=1e-6)  # its x axis is the world's y axis
-    others = seen[:, 64:96].reshape(2, 4, 8) * 6
-    assert (others[0, 0, 6], others[0].sum()) == pytest.approx((1.0, 1.0))  # south, 1 m from the border
-    # west, 10 m from the border, between rings at 6 and 12 m; west is 90 degrees to the left of north
-    assert (others[1, 1, 2], others[1, 2, 2], others[1].sum()) == pytest.approx((1 / 3, 2 / 3, 1.0))
-    assert seen[0, 96:] == pytest.approx([-12.5 / 25, 0.0, 1 / 3, 1 / 3, 2 / 6])
-    assert seen[1, 96:] == pytest.approx([-3.5 / 25, 0.0, 1 / 3, 1 / 3, 2 / 6], abs=1e-7)
-
-
-def test_the_critics_view_turns_with_the_frame_and_does_not_care_who_is_who():
-    rng = np.random.default_rng(0)
-    sheep, shepherds = rng.normal(0, 12, (30, 2)), rng.normal(0, 15, (4, 2))
-    a = 1.234
-    turned = np.array([[np.cos(a), np.sin(a)], [-np.sin(a), np.cos(a)]])
-    seen = view(arranged(sheep, shepherds), [0.0] * 4)
-    assert seen[:, :64].sum(axis=1) == pytest.approx(np.ones(4), rel=1e-5)
-    assert seen[:, 64:96].sum(axis=1) * 6 == pytest.approx(np.full(4, 3.0), rel=1e-5)
-    again = view(arranged(sheep @ turned, shepherds @ turned), [a] * 4)
-    assert again == pytest.approx(seen, abs=1e-5)
-    order = [2, 0, 3, 1]
-    mixed = view(arranged(sheep[::-1], shepherds[order]), [0.0] * 4)
-    assert mixed == pytest.approx(seen[order], abs=1e-6)
-
-
-def test_the_critic_sees_the_frame_of_the_observation_and_no_clock():
-    env = TeamVecEnv(SMALL, (3,), lidar=Lidar(sectors=64, frame="goal"), critic="world", random_clocks=False)
-    observation = env.reset()
-    for k in range(10):
-        (state, *_), (offset, *_) = env.get_attr("state"), env.get_attr("beam_offset")
-        assert observation["critic"].tobytes() == view(state, 2 * np.pi / 512 * offset).tobytes()
-        if k < 9:
-            assert view(state.but(step=5, time=1.0), [0.0] * 3).tobytes() == view(state, [0.0] * 3).tobytes()
-        observation, *_ = env.step(np.full((3, 2), 0.7))
-    away = -observation["critic"][:, 96]  # the goal lies straight ahead of everybody outside it
-    assert (away > 0).all() and np.abs(observation["critic"][:, 97]).max() < 0.03
-    assert env.observation_space.contains({name: part[0] for name, part in observation.items()})
 
 
 # ------------------------------------------------------------ SB3's interface
@@ -517,9 +437,6 @@ def test_ppo_trains_on_it_without_a_warning(n_workers, seen):
         env.close()
 
 
-# ------------------------------------------------------------ whatever may go wrong
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -566,127 +483,6 @@ def test_bad_actions_and_calls_out_of_turn():
     assert env.get_attr("decisions") == [0, 0]
     with pytest.raises(SettingsError, match=r"scenario: the function must give a Scenario \(given: 'meadow'\)"):
         TeamVecEnv(no_scenario, (2,)).reset()
-
-
-def dead(env):
-    """Whether the env says that it is closed, at once."""
-    with pytest.raises(WorkerError, match="the vector env is closed"):
-        env.reset()
-
-
-def test_an_error_in_a_worker_is_one_clear_line():
-    env = TeamVecEnv(SMALL, (1, 1), rewards={"wolf": (1.0, Fails(4))}, random_clocks=False, n_workers=2)
-    env.reset()
-    for _ in range(3):
-        env.step(np.zeros((2, 2)))
-    with pytest.raises(WorkerError) as caught:
-        env.step(np.zeros((2, 2)))
-    line = inspect.getsourcelines(Fails.__call__)[1] + 4
-    seed = next(episode_seeds(1_000_000, 0, 0))
-    assert str(caught.value) == (
-        f"worker 0: ValueError: the wolf came (team_terms.py:{line}), in world 0, episode seed {seed}"
-    )
-    dead(env)
-
-
-def test_a_worker_that_leaves_is_seen_at_once():
-    env = TeamVecEnv(SMALL, (1, 1), rewards={"wolf": (1.0, Fails(2, dies=True))}, random_clocks=False, n_workers=1)
-    env.reset()
-    env.step(np.zeros((2, 2)))
-    with pytest.raises(WorkerError, match="^worker 0 died: exit code 3$"):
-        env.step(np.zeros((2, 2)))
-    dead(env)
-
-
-@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no such signal here")
-def test_a_worker_that_is_killed_between_two_steps_is_seen():
-    env = TeamVecEnv(SMALL, (1, 1), n_workers=2)
-    env.reset()
-    victim = env._crew._workers[1].process
-    os.kill(victim.pid, signal.SIGKILL)
-    victim.join(10)
-    with pytest.raises(WorkerError, match="^worker 1 died: killed by SIGKILL$"):
-        env.step(np.zeros((2, 2)))
-    dead(env)
-
-
-def test_a_worker_that_cannot_start_says_why():
-    with pytest.raises(WorkerError, match="^worker 0: ImportError: no such module here"):
-        TeamVecEnv(SMALL, (1,), rewards={"odd": (1.0, Unreadable())}, n_workers=1)
-
-
-def test_ctrl_c_breaks_a_step_off_and_a_reset_goes_on():
-    env = TeamVecEnv(SMALL, (1, 1), rewards={"slow": (1.0, Slow(0.5))}, decision_interval=3, n_workers=2)
-    try:
-        env.reset()
-        timer = threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT))
-        timer.start()
-        with pytest.raises(KeyboardInterrupt):
-            env.step(np.zeros((2, 2)))
-        timer.join()
-        with pytest.raises(RuntimeError, match="perhaps an interrupted one: call step_wait or reset first"):
-            env.step_async(np.zeros((2, 2)))
-        env.reset()
-        assert env.get_attr("decisions") == [0, 0]
-        env.step(np.zeros((2, 2)))
-        # an interrupted question does not get mixed up with the next one
-        timer = threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT))
-        timer.start()
-        with pytest.raises(KeyboardInterrupt):
-            env.env_method("decide", np.zeros((1, 2), np.float32))
-        timer.join()
-        assert env.get_attr("index") == [0, 1]
-    finally:
-        env.close()
-
-
-SCRIPT = """
-import numpy as np
-from shepherd_phys.envs.team import TeamVecEnv
-from shepherd_phys.scenario import Scenario
-
-if __name__ == "__main__":
-    scenario = Scenario(n_sheep=6, n_flocks=1, shepherds=1, n_steps=12)
-    closed, forgotten = (TeamVecEnv(scenario, (1, 2), n_workers=2) for _ in range(2))
-    for env in (closed, forgotten):
-        env.reset()
-        env.step(np.zeros((3, 2)))
-    closed.close()
-    forgotten.step_async(np.zeros((3, 2)))
-    print("end")
-"""
-
-
-def test_nothing_is_left_behind_and_nobody_complains(tmp_path):
-    script = tmp_path / "script.py"
-    script.write_text(SCRIPT)
-    command = [sys.executable, "-P", "-W", "error", str(script)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "end\n", "")
-
-
-def test_a_script_without_its_main_guard_is_told_so(tmp_path):
-    script = tmp_path / "script.py"
-    script.write_text("from shepherd_phys.envs.team import TeamVecEnv\nTeamVecEnv('small', (1,), n_workers=1)\n")
-    done = subprocess.run([sys.executable, "-P", str(script)], capture_output=True, text=True, timeout=300, check=False)
-    assert done.returncode != 0
-    assert "a script must start its work below: if __name__ == '__main__':" in done.stderr.splitlines()[-1]
-
-
-def test_worlds_are_shared_out_evenly():
-    shares = shared_out((1, 2, 3, 4, 5, 6, 1, 2, 3, 4, 5, 6), 3)
-    assert sorted(index for share in shares for index in share) == list(range(12))
-    assert {len(share) for share in shares} == {4}
-    assert shared_out((1, 1), 5) == [[0], [1]]
-
-
-def test_workers_do_not_load_a_learning_library(tmp_path):
-    code = (
-        "import sys, shepherd_phys.envs._team_crew\n"
-        "print(*sorted({'torch', 'stable_baselines3', 'pygame', 'matplotlib'} & set(sys.modules)))"
-    )
-    done = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == "\n"
 
 
 def test_presets_work_as_scenarios():

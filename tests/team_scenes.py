@@ -1,9 +1,12 @@
-"""Reward terms and scenarios for tests of the team's vector env: of a module, so that workers can import them."""
+"""What tests of the team's vector env share; terms and scenarios of a module, so that workers can import them."""
 
 import os
 import time
 from dataclasses import dataclass
 
+import numpy as np
+
+from shepherd_phys.envs import _critic as critic
 from shepherd_phys.scenario import Scenario
 
 SMALL = Scenario(n_sheep=6, n_flocks=2, shepherds=2, n_steps=12)
@@ -67,3 +70,18 @@ class Unreadable:
 
 def _refuse():
     raise ImportError("no such module here")
+
+
+def episode_seeds(root, number, world):
+    """The seeds of a world's episodes."""
+    seeds, *_ = np.random.SeedSequence(root, spawn_key=(number, world)).spawn(3)
+    generator = np.random.default_rng(seeds)
+    while True:
+        yield int(generator.integers(2**63))
+
+
+def view(state, angle):
+    """What the critic sees of a state, (P, 101)."""
+    seen = np.full((state.n_shepherds, critic.N_NUMBERS), np.nan, np.float32)
+    critic.whole_world(state, np.array(angle, float), seen)
+    return seen

@@ -1,0 +1,23 @@
+"""Scenarios drawn anew."""
+
+import numpy as np
+import pytest
+from team_scenes import SMALL
+
+from shepherd_phys.envs.mixture import Mixture
+from shepherd_phys.settings import SettingsError
+
+
+def test_mixture_draws_within_its_ranges_and_from_its_stream():
+    mixture = Mixture(base=SMALL, n_flocks=(1, 3), n_neighbours=(2, 5))
+    drawn = [mixture(np.random.default_rng(k), 0) for k in range(60)]
+    assert {s.n_flocks for s in drawn} == {1, 2, 3}
+    assert {s.flock.n_neighbours for s in drawn} == {2, 3, 4, 5}
+    assert all(s.but(n_flocks=2, flock=SMALL.flock) == SMALL for s in drawn)
+    assert mixture(np.random.default_rng(7), 0) == mixture(np.random.default_rng(7), 5)
+    kept = mixture.but(n_neighbours=None)(np.random.default_rng(0), 0)
+    assert kept.flock == SMALL.flock
+    with pytest.raises(SettingsError, match="n_flocks may be 9, more than there are sheep"):
+        Mixture(base=SMALL, n_flocks=(1, 9))
+    with pytest.raises(SettingsError, match="the smaller number comes first"):
+        Mixture(n_flocks=(3, 1))
