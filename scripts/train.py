@@ -115,6 +115,8 @@ def prepare(options: Train, given: set[str]) -> tuple[Path, Preset]:
         if changed.but(budget=preset.budget) != preset:
             raise SettingsError(f"{options.out}: holds a run with other settings; --resume needs none but --out")
         if "budget" in given and changed.budget != preset.budget:
+            if preset.ppo.last_learning_rate is not None:
+                raise SettingsError("--budget: this run's learning rate falls over its budget, which stays what it is")
             preset = changed  # a longer run is the same run
             preset.to_toml(options.out / PRESET)
         return options.out, preset

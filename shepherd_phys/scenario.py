@@ -50,6 +50,11 @@ def _interval(value: Any) -> Any:
     return value
 
 
+def _listed(value: Any) -> Any:
+    """Files know lists only."""
+    return tuple(value) if isinstance(value, list) else value
+
+
 @settings
 class Scenario(Settings):
     """What a world holds, how it is placed at reset, and its two clocks.
@@ -60,7 +65,9 @@ class Scenario(Settings):
     n_sheep: int = Field(default=100, ge=1)
     """N."""
     n_flocks: int = Field(default=2, ge=1)
-    """Flocks of equal size (+-1) at the start."""
+    """Flocks at the start, of equal size (+-1) where ``flock_sizes`` does not say otherwise."""
+    flock_sizes: Annotated[tuple[Annotated[int, Field(ge=1)], ...], BeforeValidator(_listed)] | None = None
+    """Sheep in each flock at the start; none given: equal sizes."""
     flock_distance: Annotated[
         tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]], BeforeValidator(_interval)
     ] = (10.0, 20.0)
@@ -101,6 +108,14 @@ class Scenario(Settings):
     def __post_init__(self) -> None:
         if self.n_flocks > self.n_sheep:
             raise ValueError(f"n_flocks is {self.n_flocks}, more than there are sheep ({self.n_sheep})")
+        if self.flock_sizes is not None and (len(self.flock_sizes), sum(self.flock_sizes)) != (
+            self.n_flocks,
+            self.n_sheep,
+        ):
+            raise ValueError(
+                f"flock_sizes: needs {self.n_flocks} sizes, one a flock, that add up to the {self.n_sheep} sheep "
+                f"(given: {self.flock_sizes})"
+            )
 
     @property
     def n_shepherds(self) -> int:

@@ -26,6 +26,8 @@ def _listed(value: Any) -> Any:
 Count = Annotated[int, Field(ge=1)]
 Counts = Annotated[tuple[Count, ...], Field(min_length=1), BeforeValidator(_listed)]
 Range = Annotated[tuple[Count, Count], BeforeValidator(_listed)]
+Length = Annotated[float, Field(ge=0)]
+Span = Annotated[tuple[Length, Length], BeforeValidator(_listed)]
 
 
 @settings
@@ -52,6 +54,8 @@ class PPOSettings(Settings):
     """Passes over a rollout."""
     learning_rate: float = Field(default=3e-4, gt=0)
     """Of Adam."""
+    last_learning_rate: float | None = Field(default=None, gt=0)
+    """It falls to this one, linearly over the budget; none: it stays."""
     gamma: float = Field(default=0.98, gt=0, lt=1)
     """Discount a decision."""
     gae_lambda: float = Field(default=0.95, ge=0, le=1)
@@ -114,6 +118,10 @@ class Preset(Settings):
     """Least and most flocks, drawn anew for every episode; none: the scenario's."""
     n_neighbours: Range | None = None
     """Least and most neighbours n, drawn anew for every episode; none: the scenario's."""
+    flock_distance: Span | None = None
+    """Least and largest distance of a flock's centre from the goal's while learning [m]; none: the scenario's."""
+    uneven: float = Field(default=0.0, ge=0, le=1)
+    """Fraction of the episodes whose flocks differ in size."""
     init: str | None = None
     """Policy to start from: a shipped one's name, or a .json file."""
     critic_first: int = Field(default=0, ge=0)
@@ -159,10 +167,11 @@ class Preset(Settings):
 
     def draw(self) -> Scenario | Mixture:
         """The scenario, or what draws one for each episode."""
-        if self.n_flocks is None and self.n_neighbours is None:
-            return self.scenario
-        n_flocks = self.n_flocks or (self.scenario.n_flocks, self.scenario.n_flocks)
-        return Mixture(base=self.scenario, n_flocks=n_flocks, n_neighbours=self.n_neighbours)
+        base = self.scenario.but(flock_distance=self.flock_distance) if self.flock_distance else self.scenario
+        if self.n_flocks is None and self.n_neighbours is None and not self.uneven:
+            return base
+        n_flocks = self.n_flocks or (base.n_flocks, base.n_flocks)
+        return Mixture(base=base, n_flocks=n_flocks, n_neighbours=self.n_neighbours, uneven=self.uneven)
 
     def scheme(self) -> dict[str, tuple[float, Term]]:
         """The reward scheme, with the cost of walking if there is one."""
