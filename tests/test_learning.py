@@ -10,6 +10,7 @@ from test_learned import LIDAR, SMALL, random_weights, spec_of
 from shepherd_phys.controllers import Policy, load_policy
 from shepherd_phys.controllers.network import Actor, SectorNetwork, input_shape
 from shepherd_phys.controllers.policy_files import PolicyError
+from shepherd_phys.envs.rewards import SCHEMES
 from shepherd_phys.envs.team import TeamVecEnv
 from shepherd_phys.learning.export import actor_weights, load_actor, to_policy, to_sb3
 from shepherd_phys.learning.export import spec_of as spec_of_preset
@@ -263,11 +264,12 @@ def test_the_papers_preset_is_the_papers():
 
 
 def test_a_preset_may_mix_worlds_and_price_effort():
-    preset = TINY.but(n_flocks=(1, 3), effort=2.0, worlds=5, team_sizes=(3, 1))
+    preset = TINY.but(n_flocks=(1, 3), effort=2.0, gathered=3.0, worlds=5, team_sizes=(3, 1))
     assert preset.sizes == (3, 1, 3, 1, 3) and preset.n_slots == 11
     drawn = preset.draw()(np.random.default_rng(0), 0)
     assert 1 <= drawn.n_flocks <= 3 and drawn.flock == TINY.scenario.flock
-    assert preset.scheme()["effort"][0] == -2.0
+    assert preset.scheme()["effort"][0] == -2.0 and preset.scheme()["gathered"][0] == 3.0
+    assert set(TINY.scheme()) == set(SCHEMES["wild"])
     far = TINY.but(flock_distance=(4.0, 5.0), uneven=1.0).draw()(np.random.default_rng(0), 0)
     assert far.flock_distance == (4.0, 5.0) and far.flock_sizes is not None and far.n_flocks == TINY.scenario.n_flocks
     assert TINY.but(flock_distance=(4.0, 5.0)).draw() == TINY.scenario.but(flock_distance=(4.0, 5.0))

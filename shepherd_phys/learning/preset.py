@@ -11,7 +11,7 @@ from pydantic import BeforeValidator, Field
 from shepherd_phys.controllers.learned import POLICIES, Policy, load_policy
 from shepherd_phys.controllers.network import SectorNetwork
 from shepherd_phys.envs.mixture import Mixture
-from shepherd_phys.envs.rewards import SCHEMES, Effort, Term
+from shepherd_phys.envs.rewards import SCHEMES, Effort, Gathered, Term
 from shepherd_phys.lidar import Lidar
 from shepherd_phys.scenario import SCENARIOS, Scenario
 from shepherd_phys.settings import Settings, SettingsError, read_toml, settings, write_toml
@@ -102,6 +102,8 @@ class Preset(Settings):
     """Name of the reward scheme."""
     effort: float = Field(default=0.0, ge=0)
     """Weight of the cost of walking; 0: none."""
+    gathered: float = Field(default=0.0, ge=0)
+    """Weight of what is paid for while the herd is in the goal, all but a few; 0: nothing."""
     credit: Literal["own", "team"] = "own"
     """Who is paid for a term that has shares: each shepherd by its own, or all by the mean."""
     decision_interval: int = Field(default=5, ge=1)
@@ -174,10 +176,12 @@ class Preset(Settings):
         return Mixture(base=base, n_flocks=n_flocks, n_neighbours=self.n_neighbours, uneven=self.uneven)
 
     def scheme(self) -> dict[str, tuple[float, Term]]:
-        """The reward scheme, with the cost of walking if there is one."""
+        """The reward scheme, with what the preset adds to it."""
         scheme = dict(SCHEMES[self.reward])
         if self.effort:
             scheme["effort"] = (-self.effort, Effort())
+        if self.gathered:
+            scheme["gathered"] = (self.gathered, Gathered())
         return scheme
 
     def start(self) -> Policy | None:
