@@ -23,11 +23,9 @@ from shepherd_phys.controllers.claims import (
     UNDECIDED,
     Side,
     Trials,
-    correlation,
     judge,
-    ranks,
-    spearman,
 )
+from shepherd_phys.controllers.summary import correlation, ranks, spearman
 
 SEEDS = [41, 7, 1000, 3, 12, 8, 90, 66, 5, 23]
 N = len(SEEDS)
