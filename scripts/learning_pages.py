@@ -32,8 +32,8 @@ def figure1_page(curves: Sequence[Row], validations: Sequence[Row], home: Sequen
         "![Figure 1: mean episode reward, and sheep delivered in validation, against shepherd-steps](figure1.png)",
         "",
         "Made by `shepherd-phys reproduce`. Of each scheme, over its seeds: the mean reward of training episodes over "
-        f"the last {WINDOW} evaluations (rollouts); where the curve levels off [M shepherd-steps]; sheep in the goal at "
-        "the end of the last validation's episodes, %; shepherd-steps a second and wall-clock time of training, "
+        f"the last {WINDOW} evaluations (rollouts); where the curve levels off [M shepherd-steps]; sheep in the goal "
+        "at the end of the last validation's episodes, %; shepherd-steps a second and wall-clock time of training, "
         "validations left out.",
         "",
         line(head),
@@ -70,8 +70,8 @@ def _home(home: Sequence[Row]) -> list[str]:
         "**Time to home**",
         "",
         f"Training until the first checkpoint whose policy delivers at least {HOME:g} % with each number of flocks in "
-        "validation; that policy, judged once on reported trials: sheep in the goal at the end, %, mean [95 % bootstrap "
-        "interval].",
+        "validation; that policy, judged once on reported trials: sheep in the goal at the end, %, mean [95 % "
+        "bootstrap interval].",
         "",
         line(head),
         line(["---", *["---:"] * (len(head) - 1)]),
@@ -102,10 +102,10 @@ def ablations_page(curves: Sequence[Row], validations: Sequence[Row]) -> str:
         "",
         "![Sheep in the goal at the end of training episodes against shepherd-steps, by variant](ablations.png)",
         "",
-        "Made by `shepherd-phys reproduce`. Of each variant, over its seeds: sheep in the goal at the end of validation "
-        "episodes after training, %, mean (least to most); the mean reward of training episodes over the last "
-        f"{WINDOW} evaluations (rollouts); M shepherd-steps when training episodes first ended with half of the sheep "
-        "in; shepherd-steps a second of one process, other runs beside it.",
+        "Made by `shepherd-phys reproduce`. Of each variant, over its seeds: sheep in the goal at the end of "
+        "validation episodes after training, %, mean (least to most); the mean reward of training episodes over the "
+        f"last {WINDOW} evaluations (rollouts); M shepherd-steps when training episodes first ended with half of the "
+        "sheep in; shepherd-steps a second of one process, other runs beside it.",
         "",
         line(head),
         line(["---", *["---:"] * (len(head) - 1)]),

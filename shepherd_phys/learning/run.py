@@ -130,7 +130,7 @@ class _Run:
         self._validations = Table(folder / VALIDATION, VALIDATION_COLUMNS, self.number)
         self._clock = _Clock(seconds, learner.shepherd_steps)
         self._measures: dict[str, float] = {}
-        self.over = self._spent()
+        self.over = saved is not None and self._spent()
         """Whether the budget is spent, or the time. It changes with a rollout only: a run ends with a validation."""
 
     def _spent(self) -> bool:
