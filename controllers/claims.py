@@ -1,4 +1,4 @@
-"""The paper's two experiments and its claims about them, as tests on rows of ``episodes.csv``.
+"""The paper's two experiments and its claims, as tests on rows of ``episodes.csv`` and of ``figure1.csv``.
 
 A claim has parts, each a number with its 95 % bootstrap interval and the side on which it is claimed to lie. A part
 **holds** when its interval lies wholly on that side, **fails** when it lies wholly on the other, and is **undecided**
@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .summary import LEVEL, bootstrap, intervals
+from .curves import WINDOW, curve_of, later_by
+from .summary import correlation, intervals
 
 Floats = NDArray[np.float64]
 Row = Mapping[str, Any]
@@ -34,6 +35,11 @@ LITERAL = ("strombom-literal", "pierson-reconstructed", "elfiqi-literal")
 """As published, without a terminal rule: never a rival, never counted."""
 COUNTED = (*HEURISTICS, "original", "any", "wild")
 """Methods that c6 and c7 are about; what others show is reported beside it."""
+
+RECIPE, PAPERS_RECIPE = "fast", "paper"
+"""Training recipes that c8 is about: ours, and the paper's, which is reported beside it where it was run."""
+LEAST_SEEDS = 3
+"""Runs of a scheme below which c8 is not judged: too few have no interval worth the name."""
 
 HOLDS, FAILS, UNDECIDED = "holds", "fails", "undecided"
 
@@ -114,6 +120,8 @@ class Part:
     counts: bool = True
     """Whether the claim is about it; otherwise it is reported beside."""
     note: str = ""
+    recipe: str | None = None
+    """Of the training that it is about, where it is about training."""
 
     @property
     def verdict(self) -> str:
@@ -139,6 +147,7 @@ class Part:
             "verdict": self.verdict,
             "counts": self.counts,
             "note": self.note,
+            "recipe": self.recipe,
         }
 
 
@@ -172,16 +181,18 @@ class Claim:
 
 
 class Trials:
-    """The trials of every method at every point that has all of them.
+    """The trials of every method at every point that has all of them; and the learning curves.
 
     A point that lacks a trial counts as not run: episodes that failed or are still to come may be the hard ones.
 
     Args:
         rows: of ``episodes.csv``; in any order.
         seeds: of the trials.
+        curves: rows of ``figure1.csv``.
     """
 
-    def __init__(self, rows: Iterable[Row], seeds: Sequence[int]) -> None:
+    def __init__(self, rows: Iterable[Row], seeds: Sequence[int], curves: Iterable[Row] = ()) -> None:
+        self.curves = list(curves)
         found: dict[tuple[str, At], dict[int, Row]] = {}
         for row in rows:
             found.setdefault((row["controller"], (row["n_flocks"], row["cohesion"])), {})[row["seed"]] = row
@@ -199,15 +210,18 @@ class Trials:
         return np.array([float(row[metric]) for row in self._rows[method, at]])
 
 
-def judge(rows: Iterable[Row], seeds: Sequence[int], names: Sequence[str] | None = None) -> list[Claim]:
-    """What rows of the two experiments say to each claim.
+def judge(
+    rows: Iterable[Row], seeds: Sequence[int], names: Sequence[str] | None = None, curves: Iterable[Row] = ()
+) -> list[Claim]:
+    """What rows of the experiments say to each claim.
 
     Args:
         rows: of ``episodes.csv``, of one scenario.
         seeds: of the trials that a point must have; at least one.
         names: of `CLAIMS`; all of them where it is left out.
+        curves: rows of ``figure1.csv``.
     """
-    trials = Trials(rows, seeds)
+    trials = Trials(rows, seeds, curves)
     judged = []
     for name in CLAIMS if names is None else names:
         text, statistic, parts = CLAIMS[name]
@@ -278,54 +292,22 @@ def _follows_n(trials: Trials, metric: str, side: Side) -> Iterator[Part]:
             yield replace(part, note=f"not run: {missing}" if there else "not run")
 
 
-def correlation(x: Floats, values: Floats) -> tuple[float, float, float]:
-    """Spearman correlation of the means of k series with ``x``, and its 95 % bootstrap percentile interval.
-
-    A resample takes the same trials of every series. One whose means are all equal says nothing about the order: it
-    counts as -1 for the low end and as 1 for the high one.
-
-    Args:
-        x: (k,).
-        values: (k, n) n trials of each series, paired.
-
-    Returns:
-        value (NaN where the k means are all equal), low, high.
-    """
-    tail = 50.0 * (1.0 - LEVEL)
-    value = float(spearman(x, _even(values.mean(axis=1))[:, None])[0])
-    resampled = spearman(x, _even(bootstrap(values)))
-    low = np.percentile(np.nan_to_num(resampled, nan=-1.0), tail)
-    high = np.percentile(np.nan_to_num(resampled, nan=1.0), 100.0 - tail)
-    return value, float(low), float(high)
-
-
-def spearman(x: Floats, y: Floats) -> Floats:
-    """Spearman's rank correlation, equal values sharing the average of their ranks.
-
-    Args:
-        x: (k,).
-        y: (k, m) m series.
-
-    Returns:
-        (m,) in [-1, 1]; NaN where x or the series is constant.
-    """
-    a = ranks(x[:, None])
-    b = ranks(y)
-    a, b = a - a.mean(axis=0), b - b.mean(axis=0)
-    size = np.sqrt((a**2).sum(axis=0) * (b**2).sum(axis=0))
-    return np.asarray(np.divide((a * b).sum(axis=0), size, out=np.full(y.shape[1], np.nan), where=size > 0))
-
-
-def ranks(values: Floats) -> Floats:
-    """(k, m) rank of each value in its column, from 1; equal values share the average of their ranks."""
-    less = (values[None] < values[:, None]).sum(axis=1)
-    equal = (values[None] == values[:, None]).sum(axis=1)
-    return np.asarray(less + 0.5 * (equal + 1.0))
-
-
-def _even(means: Floats) -> Floats:
-    """Means without their last bits: the same trials summed in another order must be equal."""
-    return np.asarray(np.round(means, 9))
+def _levels_off_before(trials: Trials, first: str, then: str) -> Iterator[Part]:
+    """c8: difference of the shepherd-steps at which two schemes level off, bootstrapped over seeds."""
+    ran = {row["recipe"] for row in trials.curves}
+    for recipe in (RECIPE, *([PAPERS_RECIPE] if PAPERS_RECIPE in ran else [])):
+        part = Part(then, Side(least=0.0, strict=True), first, counts=recipe == RECIPE, recipe=recipe)
+        curves = {name: curve_of(trials.curves, recipe, name) for name in (first, then)}
+        missing = [name for name, curve in curves.items() if not curve.seeds]
+        if missing:
+            yield replace(part, note=f"not run: {', '.join(missing)}")
+        elif min(len(curve.seeds) for curve in curves.values()) < LEAST_SEEDS:
+            yield replace(part, note=f"fewer than {LEAST_SEEDS} seeds")
+        elif min(len(curve.steps) for curve in curves.values()) < WINDOW:
+            yield replace(part, note=f"fewer than {WINDOW} evaluations")
+        else:
+            value, low, high = (steps / 1e6 for steps in later_by(curves[then], curves[first]))
+            yield replace(part, value=value, low=low, high=high)
 
 
 def _learned(trials: Trials) -> list[tuple[str, bool]]:
@@ -393,8 +375,8 @@ CLAIMS: dict[str, tuple[str, str, Callable[[Trials], Iterable[Part]]]] = {
     ),
     "c8": (
         "wild levels off before any",
-        "difference of the training steps after which they level off",
-        lambda trials: [Part("wild", Side(most=0.0, strict=True), "any", note="needs the learning curves of figure 1")],
+        "difference of the shepherd-steps at which they level off [millions]",
+        lambda trials: _levels_off_before(trials, "wild", "any"),
     ),
 }
 """By name: what is claimed, what the numbers of its parts are, and the parts."""

@@ -1,4 +1,4 @@
-"""What many episodes say together: means with bootstrap intervals, and paired differences."""
+"""What many episodes say together: means with bootstrap intervals, paired differences, rank correlations."""
 
 from __future__ import annotations
 
@@ -102,6 +102,56 @@ def paired_differences(rows: Iterable[Row], baseline: str, metrics: Sequence[str
             {**dict(labels), "baseline": baseline, "trials": len(pairs), **_columns(names, intervals(values))}
         )
     return differences
+
+
+def correlation(x: NDArray[np.float64], values: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Spearman correlation of the means of k series with ``x``, and its 95 % bootstrap percentile interval.
+
+    A resample takes the same trials of every series. One whose means are all equal says nothing about the order: it
+    counts as -1 for the low end and as 1 for the high one.
+
+    Args:
+        x: (k,).
+        values: (k, n) n trials of each series, paired.
+
+    Returns:
+        value (NaN where the k means are all equal), low, high.
+    """
+    tail = 50.0 * (1.0 - LEVEL)
+    value = float(spearman(x, _even(values.mean(axis=1))[:, None])[0])
+    resampled = spearman(x, _even(bootstrap(values)))
+    low = np.percentile(np.nan_to_num(resampled, nan=-1.0), tail)
+    high = np.percentile(np.nan_to_num(resampled, nan=1.0), 100.0 - tail)
+    return value, float(low), float(high)
+
+
+def spearman(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Spearman's rank correlation, equal values sharing the average of their ranks.
+
+    Args:
+        x: (k,).
+        y: (k, m) m series.
+
+    Returns:
+        (m,) in [-1, 1]; NaN where x or the series is constant.
+    """
+    a = ranks(x[:, None])
+    b = ranks(y)
+    a, b = a - a.mean(axis=0), b - b.mean(axis=0)
+    size = np.sqrt((a**2).sum(axis=0) * (b**2).sum(axis=0))
+    return np.asarray(np.divide((a * b).sum(axis=0), size, out=np.full(y.shape[1], np.nan), where=size > 0))
+
+
+def ranks(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(k, m) rank of each value in its column, from 1; equal values share the average of their ranks."""
+    less = (values[None] < values[:, None]).sum(axis=1)
+    equal = (values[None] == values[:, None]).sum(axis=1)
+    return np.asarray(less + 0.5 * (equal + 1.0))
+
+
+def _even(means: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Means without their last bits: the same trials summed in another order must be equal."""
+    return np.asarray(np.round(means, 9))
 
 
 def summary_columns(labels: Sequence[str] = LABELS, metrics: Sequence[str] = METRICS) -> tuple[str, ...]:

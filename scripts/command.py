@@ -23,11 +23,12 @@ from shepherd_phys.settings import SettingsError
 
 LOG_SECONDS = 30.0
 """Progress is a line so often where standard error is no terminal [s]."""
-NUMBERS = ("sheep", "trials", "seed", "workers", "rounds", "candidates", "budget")
+NUMBERS = ("sheep", "trials", "seeds", "seed", "workers", "rounds", "candidates", "budget")
 WANTED = {
     **dict.fromkeys(("flocks", "cohesion", "shepherds"), "whole numbers"),
     **dict.fromkeys(NUMBERS, "a whole number"),
     "timeout": "a number of seconds",
+    "paper-hours": "a number of hours",
 }
 """What a flag takes, for the error that says so."""
 
@@ -71,7 +72,8 @@ def parsed(cls: type[T], prog: str, argv: Sequence[str]) -> tuple[T, set[str]]:
         wanted = [f"; --{name} takes {what}" for name, what in WANTED.items() if f"--{name}" in problem]
         raise SettingsError(f"{problem}{''.join(wanted[:1])} (see {prog} --help)") from None
     names = [f.name for f in fields(cls)]  # type: ignore[arg-type]
-    given = {name for name in names if any(word.split("=")[0] == f"--{name}" for word in argv)}
+    words = {word.split("=")[0].replace("_", "-") for word in argv}
+    given = {name for name in names if f"--{name.replace('_', '-')}" in words}
     scheduler = getattr(options, "scheduler", None)
     if scheduler is not None and not ADDRESS.fullmatch(scheduler):
         raise SettingsError(f"scheduler: {scheduler!r} is no address; it must be like tcp://HOST:PORT")

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 import matplotlib.style
@@ -50,20 +52,38 @@ def draw(experiment: Experiment, summary: Sequence[Mapping[str, Any]]) -> bytes:
         experiment: what is varied.
         summary: rows of its CSV; controllers are drawn in the order in which they come.
     """
-    with matplotlib.style.context("default", after_reset=True):  # whatever the user's matplotlibrc says
-        figure = Figure(figsize=SIZE, dpi=DPI, layout="constrained")
-        FigureCanvasAgg(figure)
-        left, right = figure.subplots(1, 2)
+    with picture() as drawn:
+        left, right = drawn.figure.subplots(1, 2)
         _panel(left, experiment, summary, "in_goal_end")
         _panel(right, experiment, summary, "path_length")
         left.set_title("(a) sheep in the goal at the end, %", fontsize=10, loc="left")
         left.set_ylim(-4.0, 104.0)
         right.set_title("(b) path of a shepherd, m (mean of the team)", fontsize=10, loc="left")
         right.set_ylim(bottom=0.0)
-        figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+        drawn.figure.legend(
+            *left.get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False, fontsize=9
+        )
+    return drawn.png
+
+
+@dataclass
+class Drawn:
+    """A figure to draw into, and what it has become."""
+
+    figure: Figure
+    png: bytes = b""
+
+
+@contextmanager
+def picture() -> Iterator[Drawn]:
+    """An empty figure on which users' style sheets have no say; at the end it is PNG."""
+    with matplotlib.style.context("default", after_reset=True):
+        drawn = Drawn(Figure(figsize=SIZE, dpi=DPI, layout="constrained"))
+        FigureCanvasAgg(drawn.figure)
+        yield drawn
         file = io.BytesIO()
-        figure.savefig(file, format="png", metadata={"Software": None})  # else it names the version
-        return file.getvalue()
+        drawn.figure.savefig(file, format="png", metadata={"Software": None})  # else it names the version
+        drawn.png = file.getvalue()
 
 
 def _panel(axes: Axes, experiment: Experiment, summary: Sequence[Mapping[str, Any]], metric: str) -> None:

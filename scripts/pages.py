@@ -40,11 +40,11 @@ def figure_page(name: str, summary: Sequence[Mapping[str, Any]]) -> str:
     ]
     for metric, (title, digits) in MEASURES.items():
         head = ["controller", *(SHOWN[experiment.varied].format(column) for column in columns)]
-        lines += ["", f"**{title}**", "", _line(head), _line(["---", *["---:"] * len(columns)])]
+        lines += ["", f"**{title}**", "", line(head), line(["---", *["---:"] * len(columns)])]
         for method in methods:
             rows = [cells.get((method, column)) for column in columns]
             shown = ["" if row is None else _interval(row, f"{metric}_mean", f"{metric}_", digits) for row in rows]
-            lines.append(_line([f"`{method}`", *shown]))
+            lines.append(line([f"`{method}`", *shown]))
     return "\n".join([*lines, ""])
 
 
@@ -61,15 +61,15 @@ def claims_page(report: Mapping[str, Any]) -> str:
         "values with 95 % bootstrap intervals.",
         *few_trials(report),
         "",
-        _line(["claim", "says", "verdict"]),
-        _line(["---"] * 3),
+        line(["claim", "says", "verdict"]),
+        line(["---"] * 3),
     ]
     for claim in report["claims"]:
-        lines.append(_line([claim["claim"], claim["text"], f"**{claim['verdict']}**"]))
+        lines.append(line([claim["claim"], claim["text"], f"**{claim['verdict']}**"]))
     for claim in report["claims"]:
         lines += ["", f"## {claim['claim']}: {claim['text']}", "", f"{claim['statistic']}; {claim['verdict']}.", ""]
-        lines += [_line(PART_HEAD), _line(["---", "---", "---:", "---", "---"])]
-        lines += [_line(part_cells(part)) for part in claim["parts"]]
+        lines += [line(PART_HEAD), line(["---", "---", "---:", "---", "---"])]
+        lines += [line(part_cells(part)) for part in claim["parts"]]
     return "\n".join([*lines, ""])
 
 
@@ -87,6 +87,8 @@ def part_cells(part: Mapping[str, Any]) -> tuple[str, ...]:
     """A part of a claim as cells under `PART_HEAD`."""
     method = part["method"] if part["rival"] is None else f"{part['method']} - {part['rival']}"
     at = "" if part["n_flocks"] is None else f"flocks: {part['n_flocks']}, n = {part['cohesion']}"
+    if part.get("recipe") is not None:  # what was judged before there were recipes has none
+        at = f"recipe {part['recipe']}"
     digits = ".2f" if 0 in (part["least"], part["most"]) else ".1f"  # a correlation, or percent and metres
     value = part["note"] if part["value"] is None else _interval(part, "value", "", digits)
     verdict = part["verdict"] if part["counts"] else f"({part['verdict']}, beside)"
@@ -102,5 +104,6 @@ def _range(values: Iterable[Any]) -> str:
     return str(found[0]) if len(found) == 1 else f"{found[0]} to {found[-1]}"
 
 
-def _line(cells: Sequence[str]) -> str:
+def line(cells: Sequence[str]) -> str:
+    """Cells as a line of a table."""
     return f"| {' | '.join(cells)} |"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import json
+import math
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -24,6 +25,7 @@ from shepherd_phys.controllers.evaluation import COLUMNS, ControllerError, trial
 from shepherd_phys.controllers.summary import summarise, summary_columns
 from shepherd_phys.settings import SettingsError
 
+from . import studies
 from .command import at_least, cpu_count, fail, flag, parsed, progress_bar, workforce
 from .evaluate import print_table, ready
 from .pages import PART_HEAD, claims_page, few_trials, figure_page, part_cells
@@ -31,29 +33,47 @@ from .points import episode, points, table, tasks
 
 PROG = "shepherd-phys reproduce"
 SCENARIO = "paper"
-CHOICES = (*EXPERIMENTS, "all")
+EPISODES = (*EXPERIMENTS, "all")
+"""Figures made of episodes; all of these."""
+CHOICES = ("figure1", *EPISODES, "ablations")
+GOES_WITH = {
+    **dict.fromkeys(("literal", "controllers", "scheduler", "gather"), EPISODES),
+    **dict.fromkeys(("trials", "seed", "timeout"), ("figure1", *EPISODES)),
+    **dict.fromkeys(("seeds", "budget"), ("figure1", "ablations")),
+    "paper_hours": ("figure1",),
+}
+"""Flags that not every figure takes."""
 
 
 @dataclass(frozen=True)
 class Reproduce:
-    """Run the paper's experiments with every method that there is, draw its figures, and judge its claims.
+    """Run the paper's experiments, draw its figures, and judge its claims.
 
-    Writes into the folder --out, for each figure, its CSV, Markdown tables and drawing; claims.json and claims.md;
-    episodes.csv; and a ledger that lets a stopped run continue: give the same command again.
+    figure2 and figure3 compare every method that there is, and take some hours; figure1, the learning curves, and
+    ablations, what each ingredient of our recipe buys, train for many hours. all is figure2 and figure3. Writes into
+    the folder --out, for each figure, its CSV, Markdown tables and drawing; claims.json and claims.md; and what lets a
+    stopped run continue: give the same command again.
     """
 
     figure: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="|".join(CHOICES))]
-    """Which of the paper's figures; a point that two of them share is run once."""
+    """What to reproduce; all is figure2 and figure3, which share a point that is run once."""
     literal: tyro.conf.FlagCreatePairsOff[bool] = False
     """Add the heuristics as published: strombom-literal, pierson-reconstructed, elfiqi-literal."""
     controllers: Annotated[tuple[str, ...], flag("NAME ..", "all tuned heuristics and shipped policies")] = ()
     """Only these, by name or module:Name of your own; claims on others stay undecided."""
     trials: Annotated[int, flag("T")] = 100
-    """Episodes a point."""
+    """Episodes a point; in figure1, of the policies whose time to home is told."""
     seed: Annotated[int, flag("S")] = 20_000
     """Root seed: trial i has a seed derived from S and i alone, the same for every controller and point."""
+    seeds: Annotated[int | None, flag("K", "5 in figure1, 3 in ablations")] = None
+    """Training runs of each scheme or variant, with seeds from 1,000,000."""
+    budget: Annotated[int | None, flag("N", "6,000,000 in figure1, 2,500,000 in ablations")] = None
+    """Shepherd-steps of each training run."""
+    paper_hours: Annotated[float, flag("HOURS")] = 2.0
+    """In figure1: hours of training for one run by the preset paper, drawn beside; 0: none."""
     workers: Annotated[int, flag("W")] = cpu_count()
-    """Worker processes; the results do not depend on it."""
+    """Worker processes; the results do not depend on it. figure1 trains one run at a time with all of them, ablations
+    as many runs at a time."""
     scheduler: Annotated[str | None, flag("ADDRESS", "")] = None
     """Instead of --workers: the scheduler of a Dask cluster, e.g. tcp://10.0.0.1:8786."""
     timeout: Annotated[float, flag("SECONDS")] = 600.0
@@ -66,7 +86,7 @@ class Reproduce:
     """Print one JSON object, the rows of each figure and the claims, and nothing else, on standard output."""
 
 
-LEAST = {"trials": 1, "seed": 0, "workers": 1}
+LEAST = {"trials": 1, "seed": 0, "seeds": 1, "budget": 1, "workers": 1}
 
 
 def main(argv: Sequence[str]) -> int:
@@ -77,7 +97,36 @@ def main(argv: Sequence[str]) -> int:
         return fail(PROG, error, 2)
     out = sys.stdout
     with contextlib.redirect_stdout(sys.stderr):  # a user's classes may print wherever they are touched
-        return _main(options, out)
+        return _main(options, out) if options.figure in EPISODES else learn(options, out)
+
+
+def learn(options: Reproduce, out: TextIO) -> int:
+    """Run a study of learning; the exit status as of `main`."""
+    figure, folder = options.figure, options.out
+    how: dict[str, Any] = {
+        "n_seeds": options.seeds or studies.SEEDS[figure],
+        "budget": options.budget or studies.BUDGETS[figure],
+        "workers": options.workers,
+    }
+    try:
+        check_drawing()
+        if figure == "ablations":
+            result = studies.ablations(folder, **how)
+        else:
+            reported = studies.Reported(SCENARIO, options.trials, options.seed, options.workers, options.timeout)
+            result = studies.figure1(folder, **how, paper_hours=options.paper_hours, reported=reported)
+    except SettingsError as error:
+        return fail(PROG, error, 2)
+    except CampaignError as error:
+        return fail(PROG, error, 1)
+    except KeyboardInterrupt:
+        return fail(PROG, f"stopped; the runs are kept in {folder / studies.TRAINING}: the same command continues", 130)
+    print(json.dumps(result.tables, allow_nan=False, indent=1) if options.json else result.page, file=out)
+    for path in result.paths:
+        print(path, file=sys.stderr if options.json else out)
+    for failure in result.failures:
+        print(f"{PROG}: {failure}", file=sys.stderr)
+    return 1 if result.failures else 0
 
 
 def _main(options: Reproduce, out: TextIO) -> int:
@@ -86,6 +135,7 @@ def _main(options: Reproduce, out: TextIO) -> int:
     seeds = [trial_seed(options.seed, trial) for trial in range(options.trials)]
     try:
         check_drawing()
+        curves = studies.kept_curves(options.out)
         todo, everything = work(asked, methods, seeds), work(list(EXPERIMENTS), methods, seeds)
     except (SettingsError, ControllerError) as error:
         return fail(PROG, error, 2)
@@ -110,7 +160,7 @@ def _main(options: Reproduce, out: TextIO) -> int:
                     "trials": options.trials,
                     "seed": options.seed,
                     "version": __version__,
-                    "claims": [claim.to_dict() for claim in judge(rows, seeds)],
+                    "claims": [claim.to_dict() for claim in judge(rows, seeds, curves=curves)],
                 }
                 paths = write_files(options.out, rows, summaries, claims)
             except CampaignError as error:
@@ -244,5 +294,11 @@ def read_options(argv: Sequence[str]) -> Reproduce:
     for name in ("controllers", "gather"):
         if name in given and not getattr(options, name):
             raise SettingsError(f"--{name}: needs at least one value")
+    for name, figures in GOES_WITH.items():
+        if name in given and options.figure not in figures:
+            shown = name.replace("_", "-")
+            raise SettingsError(f"--{shown}: goes with {', '.join(figures)}, not with {options.figure}")
     at_least(vars(options), LEAST)
+    if not 0.0 <= options.paper_hours < math.inf:
+        raise SettingsError(f"paper-hours: {options.paper_hours} is impossible; it must be a number of at least 0")
     return options

@@ -16,7 +16,7 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from shepherd_phys.learning.folder import BEST, CURVE, POLICY, PRESET, VALIDATION, begin
+from shepherd_phys.learning.folder import BEST, CURVE, POLICY, PRESET, VALIDATION, agree, begin
 from shepherd_phys.learning.preset import Preset, load_preset
 from shepherd_phys.settings import SettingsError
 
@@ -62,9 +62,7 @@ def main(argv: Sequence[str]) -> int:
     try:
         options, flags = parsed(Train, PROG, argv)
         at_least(vars(options), {"seed": 0, "budget": 1, "workers": 1})
-        missing = [name for name in LIBRARIES if importlib.util.find_spec(name) is None]
-        if missing:
-            raise SettingsError(f"{', '.join(missing)} is missing: pip install 'shepherd-phys[train]'")
+        check_libraries()
         folder, preset = prepare(options, flags)
     except SettingsError as error:
         return fail(PROG, error, 2)
@@ -111,15 +109,14 @@ def prepare(options: Train, given: set[str]) -> tuple[Path, Preset]:
             raise SettingsError(f"{options.out}: holds no run to resume (no {PRESET})")
         preset = Preset.from_toml(options.out / PRESET)
         wanted = load_preset(options.preset) if "preset" in given else preset
-        changed = wanted.but(**changes)
-        if changed.but(budget=preset.budget) != preset:
-            raise SettingsError(f"{options.out}: holds a run with other settings; --resume needs none but --out")
-        if "budget" in given and changed.budget != preset.budget:
-            if preset.ppo.last_learning_rate is not None:
-                raise SettingsError("--budget: this run's learning rate falls over its budget, which stays what it is")
-            preset = changed  # a longer run is the same run
-            preset.to_toml(options.out / PRESET)
-        return options.out, preset
+        changed = wanted.but(**{"budget": preset.budget, **changes})
+        try:
+            agree(options.out, changed)
+        except SettingsError as error:
+            raise SettingsError(f"{error}; --resume needs none but --out") from None
+        if changed != preset:
+            changed.to_toml(options.out / PRESET)
+        return options.out, changed
     preset = load_preset(options.preset).but(**changes)
     folder = options.out or Path("runs") / f"{Path(options.preset).stem}-{preset.reward}-{preset.seed}"
     preset.start()  # before a folder is made that the next attempt would find
@@ -140,24 +137,45 @@ def progress_bar() -> Iterator[Any]:
 
     def report(now: Any) -> None:
         nonlocal logged
-        steps = f"{now.shepherd_steps:,} shepherd-steps"
         if now.validation:
-            points = ", ".join(
-                f"{row['in_goal_end']:.1f} % in, {row['path_length']:.0f} m with {row['n_flocks']} flocks"
-                + (f" n {row['cohesion']}" if len({r["cohesion"] for r in now.validation}) > 1 else "")
-                + (f" {row['n_shepherds']} shepherds" if len({r["n_shepherds"] for r in now.validation}) > 1 else "")
-                for row in now.validation
-            )
-            console.print(f"validation at {steps}: {points}", soft_wrap=True)
+            console.print(validation_of(now), soft_wrap=True)
             return
-        left = clock(max(0, now.budget - now.shepherd_steps) / max(now.rate, 1e-9))
-        told = f"{now.rate:,.0f} shepherd-steps/s, {left} left"
-        if math.isfinite(now.measures["episode_reward"]):
-            told += f", reward {now.measures['episode_reward']:.2f}, {now.measures['in_goal_end']:.0f} % in"
+        told = pace_of(now)
         bar.update(shown, total=now.budget, completed=min(now.shepherd_steps, now.budget), told=told)
         if not console.is_terminal and time.monotonic() - logged > LOG_SECONDS:
             logged = time.monotonic()
-            print(f"{steps}: {told}", file=sys.stderr, flush=True)
+            print(f"{now.shepherd_steps:,} shepherd-steps: {told}", file=sys.stderr, flush=True)
 
     with bar:
         yield report
+
+
+def pace_of(now: Any) -> str:
+    """What a run reports of a rollout, in words; pace and time left are of training, without validations."""
+    left = clock(max(0, now.budget - now.shepherd_steps) / max(now.rate, 1e-9))
+    told = f"{now.rate:,.0f} shepherd-steps/s, {left} of training left"
+    if math.isfinite(now.measures["episode_reward"]):
+        told += f", reward {now.measures['episode_reward']:.2f}, {now.measures['in_goal_end']:.0f} % in"
+    return told
+
+
+def validation_of(now: Any) -> str:
+    """What a run reports of a validation, in words."""
+    points = ", ".join(
+        f"{row['in_goal_end']:.1f} % in, {row['path_length']:.0f} m with {row['n_flocks']} flocks"
+        + (f" n {row['cohesion']}" if len({r["cohesion"] for r in now.validation}) > 1 else "")
+        + (f" {row['n_shepherds']} shepherds" if len({r["n_shepherds"] for r in now.validation}) > 1 else "")
+        for row in now.validation
+    )
+    return f"validation at {now.shepherd_steps:,} shepherd-steps: {points}"
+
+
+def check_libraries() -> None:
+    """Find out whether what training needs is there.
+
+    Raises:
+        SettingsError: names what is missing.
+    """
+    missing = [name for name in LIBRARIES if importlib.util.find_spec(name) is None]
+    if missing:
+        raise SettingsError(f"{', '.join(missing)} is missing: pip install 'shepherd-phys[train]'")

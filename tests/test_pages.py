@@ -8,12 +8,24 @@ from pathlib import Path
 import pytest
 
 from shepherd_phys.controllers.claims import EXPERIMENTS, judge
+from shepherd_phys.controllers.curves import COLUMNS
 from shepherd_phys.controllers.evaluation import LABELS
+from shepherd_phys.scripts.curves import VALIDATIONS, read_rows
+from shepherd_phys.scripts.learning_pages import ablations_page, figure1_page
 from shepherd_phys.scripts.pages import claims_page, figure_page
 from shepherd_phys.scripts.points import points
+from shepherd_phys.scripts.studies import HOME_COLUMNS
 
 REPRODUCTION = Path(__file__).parent.parent / "docs" / "reproduction"
-FILES = [*(f"{name}.{kind}" for name in EXPERIMENTS for kind in ("csv", "md", "png")), "claims.json", "claims.md"]
+LEARNING = {
+    "figure1": ["figure1.csv", "figure1-validation.csv", "time-to-home.csv", "figure1.md", "figure1.png"],
+    "ablations": ["ablations.csv", "ablations-validation.csv", "ablations.md", "ablations.png"],
+}
+FILES = [
+    *(f"{name}.{kind}" for name in EXPERIMENTS for kind in ("csv", "md", "png")),
+    *(name for names in LEARNING.values() for name in names),
+    *("claims.json", "claims.md"),
+]
 LINKED = [name for name in FILES if name.endswith((".md", ".png"))]
 
 
@@ -104,6 +116,17 @@ def test_the_guides_results_are_of_the_controllers_and_the_world_as_they_are(nam
     for row in read(REPRODUCTION / f"{name}.csv"):
         (point,) = points(controllers=[row["controller"]], flocks=[row["n_flocks"]], cohesion=[row["cohesion"]])
         assert point.settings_hash() == row["settings_hash"], str(point)
+
+
+@pytest.mark.parametrize("name", LEARNING)
+def test_the_guides_curves_say_what_their_csvs_hold(name):
+    if not (REPRODUCTION / f"{name}.csv").exists():
+        pytest.skip("no results are committed")
+    columns = {"time-to-home.csv": HOME_COLUMNS, f"{name}.csv": COLUMNS, f"{name}-validation.csv": VALIDATIONS}
+    tables = [read_rows(REPRODUCTION / file, columns[file]) for file in LEARNING[name] if file.endswith(".csv")]
+    page = {"figure1": figure1_page, "ablations": ablations_page}[name]
+    assert (REPRODUCTION / f"{name}.md").read_text("utf-8") == page(*tables)
+    assert all((REPRODUCTION / file).stat().st_size < 500_000 for file in LEARNING[name])
 
 
 def test_the_guides_claims_say_what_was_judged():

@@ -248,7 +248,7 @@ def test_work_is_three_shepherds_and_a_hundred_sheep():
 
 MISTAKES = [
     ("", "figure"),
-    ("figure9", "figure: 'figure9' is unknown; there are figure2, figure3, all"),
+    ("figure9", "figure: 'figure9' is unknown; there are figure1, figure2, figure3, all, ablations"),
     ("figure2 figure3", "Unrecognized options: figure3"),
     ("figure2 --trials 0", "trials: 0 is impossible; it must be at least 1"),
     ("figure2 --trials many", "; --trials takes a whole number"),
@@ -259,6 +259,18 @@ MISTAKES = [
     ("figure2 --controllers nobody", "controllers: 'nobody' is unknown; there are "),
     ("figure2 --controllers mine:Nobody", "controllers: mine:Nobody: module 'mine' has no 'Nobody'"),
     ("figure2 --flocks 3", "Unrecognized options: --flocks"),
+    ("figure1 --literal", "--literal: goes with figure2, figure3, all, not with figure1"),
+    ("figure1 --controllers idle", "--controllers: goes with figure2, figure3, all, not with figure1"),
+    ("ablations --trials 5", "--trials: goes with figure1, figure2, figure3, all, not with ablations"),
+    ("ablations --paper-hours 1", "--paper-hours: goes with figure1, not with ablations"),
+    ("ablations --paper_hours=1", "--paper-hours: goes with figure1, not with ablations"),
+    ("all --budget 9", "--budget: goes with figure1, ablations, not with all"),
+    ("figure3 --seeds 2", "--seeds: goes with figure1, ablations, not with figure3"),
+    ("figure1 --seeds 0", "seeds: 0 is impossible; it must be at least 1"),
+    ("figure1 --budget many", "; --budget takes a whole number"),
+    ("figure1 --paper-hours nan", "paper-hours: nan is impossible; it must be a number of at least 0"),
+    ("figure1 --paper-hours -1", "paper-hours"),
+    ("figure1 --paper-hours long", "; --paper-hours takes a number of hours"),
     ("figure2 --out tiny.toml", "tiny.toml: cannot be made or written"),
     ("figure2 --out used", "used: is in use by another run"),
 ]

@@ -23,7 +23,7 @@ from shepherd_phys.settings import tagged
 def spec_of(preset: Preset, shepherd_steps: int = 0) -> PolicySpec:
     """What the file of a policy trained by ``preset`` says beside its weights."""
     training = preset.to_dict()
-    for name in ("scenario", "lidar", "network", "reward", "effort", "credit"):
+    for name in ("scenario", "lidar", "network", "reward", "effort", "alpha", "credit"):
         training.pop(name, None)
     rewards = {
         "scheme": preset.reward,

@@ -19,6 +19,7 @@ CURVE = "curve.csv"
 VALIDATION = "validation.csv"
 POLICY = "policy.json"
 BEST = "best.json"
+FIRST = "first.json"
 CHECKPOINTS = "checkpoints"
 TENSORBOARD = "tensorboard"
 LOCK = "run.lock"
@@ -29,8 +30,9 @@ CURVE_COLUMNS = (
     "rollout", "shepherd_steps", "decisions", "seconds", "episodes", "episode_reward", "in_goal_end", "path_length",
     "value_loss", "policy_gradient_loss", "approx_kl", "clip_fraction", "explained_variance", "std",
 )  # fmt: skip
-"""Of ``curve.csv``, one row a rollout: counts and wall-clock seconds since the run began; means over the whole
-episodes that ended in the rollout, empty where none did; PPO's measures."""
+"""Of ``curve.csv``, one row a rollout: counts since the run began, and the wall-clock seconds that training alone has
+taken (rollouts, learning and checkpoints; validations are left out); means over the whole episodes that ended in the
+rollout, empty where none did; PPO's measures."""
 VALIDATION_COLUMNS = ("checkpoint", "shepherd_steps", "n_flocks", "cohesion", "n_shepherds", "trials", *MEASURES)
 """Of ``validation.csv``, one row a validation and point."""
 
@@ -48,6 +50,20 @@ def begin(folder: Path, preset: Preset) -> None:
     except OSError as error:
         raise SettingsError(f"{folder}: cannot be made ({error.strerror})") from None
     preset.to_toml(folder / PRESET)
+
+
+def agree(folder: Path, preset: Preset) -> Preset:
+    """The preset of a folder's run, which must be the one given but for its budget: a longer run is the same run.
+
+    Raises:
+        SettingsError: it is another run, or none that can be read.
+    """
+    kept = Preset.from_toml(folder / PRESET)
+    if kept.but(budget=preset.budget) != preset:
+        raise SettingsError(f"{folder}: holds a run with other settings")
+    if kept.budget != preset.budget and kept.ppo.last_learning_rate is not None:
+        raise SettingsError(f"{folder}: its learning rate falls over its budget, {kept.budget}, which stays what it is")
+    return kept
 
 
 @contextmanager

@@ -11,7 +11,7 @@ from pydantic import BeforeValidator, Field
 from shepherd_phys.controllers.learned import POLICIES, Policy, load_policy
 from shepherd_phys.controllers.network import SectorNetwork
 from shepherd_phys.envs.mixture import Mixture
-from shepherd_phys.envs.rewards import SCHEMES, Effort, Gathered, Term
+from shepherd_phys.envs.rewards import SCHEMES, Effort, Gathered, Occlusion, Term
 from shepherd_phys.lidar import Lidar
 from shepherd_phys.scenario import SCENARIOS, Scenario
 from shepherd_phys.settings import Settings, SettingsError, read_toml, settings, write_toml
@@ -88,6 +88,8 @@ class Validation(Settings):
     """Root seed; trial i has the seed that `shepherd-phys evaluate --seed` gives it."""
     every: int = Field(default=1, ge=1)
     """Checkpoints from one validation to the next."""
+    passes: float | None = Field(default=None, gt=0, le=100)
+    """Sheep delivered that every point must reach [%]: the first policy for which all do is kept; none: no such."""
     path_cost: float = Field(default=0.0, ge=0)
     """What a metre walked takes off the sheep delivered when the best policy is chosen [% / m]."""
 
@@ -104,6 +106,8 @@ class Preset(Settings):
     """Weight of the cost of walking; 0: none."""
     gathered: float = Field(default=0.0, ge=0)
     """Weight of what is paid for while the herd is in the goal, all but a few; 0: nothing."""
+    alpha: float | None = Field(default=None, ge=0)
+    """Least useful distance of the occlusion term [m]; none: the scheme's."""
     credit: Literal["own", "team"] = "own"
     """Who is paid for a term that has shares: each shepherd by its own, or all by the mean."""
     decision_interval: int = Field(default=5, ge=1)
@@ -144,6 +148,8 @@ class Preset(Settings):
     def __post_init__(self) -> None:
         if self.reward not in SCHEMES:
             raise ValueError(f"reward: {self.reward!r} is not one of {', '.join(SCHEMES)}")
+        if self.alpha is not None and not any(isinstance(t, Occlusion) for _, t in SCHEMES[self.reward].values()):
+            raise ValueError(f"alpha: the reward {self.reward!r} has no occlusion term (given: {self.alpha})")
         try:
             self.network.shapes(self.lidar)
             self.draw()
@@ -176,8 +182,12 @@ class Preset(Settings):
         return Mixture(base=base, n_flocks=n_flocks, n_neighbours=self.n_neighbours, uneven=self.uneven)
 
     def scheme(self) -> dict[str, tuple[float, Term]]:
-        """The reward scheme, with what the preset adds to it."""
+        """The reward scheme, with what the preset changes and adds."""
         scheme = dict(SCHEMES[self.reward])
+        if self.alpha is not None:
+            for name, (weight, term) in scheme.items():
+                if isinstance(term, Occlusion):
+                    scheme[name] = (weight, term.but(alpha=self.alpha))
         if self.effort:
             scheme["effort"] = (-self.effort, Effort())
         if self.gathered:

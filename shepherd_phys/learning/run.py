@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,6 +22,7 @@ from shepherd_phys.learning.folder import (
     CHECKPOINTS,
     CURVE,
     CURVE_COLUMNS,
+    FIRST,
     POLICY,
     PRESET,
     TENSORBOARD,
@@ -40,33 +42,39 @@ class Progress(NamedTuple):
     shepherd_steps: int
     budget: int
     rate: float
-    """Shepherd-steps a second since this process began to train, validations included."""
+    """Shepherd-steps a second since this process began to train, validations left out."""
     measures: Mapping[str, float]
     """Of the rollout, see `CURVE_COLUMNS`."""
     validation: Sequence[Mapping[str, Any]]
     """The rows of a validation; empty after a rollout."""
 
 
-class Best(NamedTuple):
-    """The best policy so far by validation."""
+class Chosen(NamedTuple):
+    """A policy that validation has picked."""
 
     score: float
     shepherd_steps: int
     weights: dict[str, NDArray[np.float32]]
 
 
-def train(folder: Path, n_workers: int = 1, report: Callable[[Progress], None] = lambda _: None) -> Best | None:
+def train(
+    folder: Path,
+    n_workers: int = 1,
+    report: Callable[[Progress], None] = lambda _: None,
+    seconds: float = math.inf,
+) -> Chosen | None:
     """Train in a folder, from its last checkpoint if it has one, until the budget is spent.
 
-    Writes `CURVE`, `VALIDATION`, checkpoints and what TensorBoard reads; `POLICY`, the latest policy, and `BEST`, the
-    best by validation. Killed at any moment it loses at most what came after the last checkpoint, and goes on from
-    there exactly as if it had not been killed.
+    Writes `CURVE`, `VALIDATION`, checkpoints and what TensorBoard reads; `POLICY`, the latest policy, `BEST`, the best
+    by validation, and `FIRST`, the first that passed where the preset says what passing is. Killed at any moment it
+    loses at most what came after the last checkpoint, and goes on from there exactly as if it had not been killed.
 
     Args:
         folder: of the run, made by `shepherd_phys.learning.folder.begin`.
         n_workers: processes for the worlds, and as many for validations; 1: none but this one. Results do not depend
             on it.
         report: called after each rollout and each validation.
+        seconds: of training, as in the curve: the run ends with the first rollout that reaches them, too.
 
     Returns:
         the best policy.
@@ -83,14 +91,14 @@ def train(folder: Path, n_workers: int = 1, report: Callable[[Progress], None] =
         learner = Learner(preset, n_workers if n_workers > 1 else 0, logger, fresh=saved is None)
         try:
             with validator(preset, n_workers) as validate:
-                run = _Run(folder, learner, validate, report, saved)
+                run = _Run(folder, learner, validate, report, saved, seconds)
                 while not run.over:
                     run.interval()
                     if run.over or run.number % preset.validation.every == 0:
                         run.judge()
                     run.save()
                 logger.dump(learner.model.num_timesteps)
-                return run.best
+                return run.chosen.get(BEST)
         finally:
             learner.close()
             logger.close()
@@ -106,24 +114,28 @@ class _Run:
         validate: Validator,
         report: Callable[[Progress], None],
         saved: Checkpoint | None,
+        limit: float,
     ) -> None:
         self._folder, self._learner, self._validate, self._report = folder, learner, validate, report
+        self._limit = limit
         self.number = 0
-        self.best: Best | None = None
+        self.chosen: dict[str, Chosen] = {}
+        """By the file that holds it."""
         seconds = 0.0
         if saved is not None:
             learner.restore(saved.arrays, saved.facts)
-            self.number, self.best, seconds = saved.number, _best_of(saved), float(saved.facts["seconds"])
+            self.number, self.chosen, seconds = saved.number, _chosen_of(saved), float(saved.facts["seconds"])
             self._export()  # the kill may have come between the two files of a policy
         self._curve = Table(folder / CURVE, CURVE_COLUMNS, learner.rollouts)
         self._validations = Table(folder / VALIDATION, VALIDATION_COLUMNS, self.number)
         self._clock = _Clock(seconds, learner.shepherd_steps)
         self._measures: dict[str, float] = {}
+        self.over = saved is not None and self._spent()
+        """Whether the budget is spent, or the time. It changes with a rollout only: a run ends with a validation."""
 
-    @property
-    def over(self) -> bool:
-        """Whether the budget is spent."""
-        return self._learner.shepherd_steps >= self._learner.preset.budget
+    def _spent(self) -> bool:
+        seconds = self._clock.seconds()
+        return self._learner.shepherd_steps >= self._learner.preset.budget or seconds >= self._limit
 
     def interval(self) -> None:
         """Begin anew in all worlds and learn from as many rollouts as lie between two checkpoints."""
@@ -147,19 +159,23 @@ class _Run:
                     logger.record(f"episodes/{name}", measures[name])
             logger.record("time/shepherd_steps", learner.shepherd_steps)
             self._tell(())
+            self.over = self._spent()
             if self.over:
                 break
         self.number += 1
 
     def judge(self) -> None:
-        """Validate the policy; keep it if it is the best so far."""
+        """Validate the policy; keep it if it is the best so far, or the first that passes."""
         learner, logger = self._learner, self._learner.model.logger
         steps = learner.shepherd_steps
         policy = to_policy(learner.model, spec_of(learner.preset, steps))
-        rows = self._validate(policy)
+        with self._clock.stopped():
+            rows = self._validate(policy)
         score = self._validate.score(rows)
-        if self.best is None or score > self.best.score:
-            self.best = Best(score, steps, policy.weights)
+        if BEST not in self.chosen or score > self.chosen[BEST].score:
+            self.chosen[BEST] = Chosen(score, steps, policy.weights)
+        if FIRST not in self.chosen and self._validate.passes(rows):
+            self.chosen[FIRST] = Chosen(score, steps, policy.weights)
         for row in rows:
             self._validations.add({**row, "checkpoint": self.number, "shepherd_steps": steps})
             point = f"{row['n_flocks']}_flocks_n_{row['cohesion']}_{row['n_shepherds']}_shepherds"
@@ -171,19 +187,19 @@ class _Run:
         """Write the checkpoint and the policies."""
         arrays, facts = self._learner.state()
         facts["seconds"] = self._clock.seconds()
-        if self.best is not None:
-            arrays |= {f"best/{name}": array for name, array in self.best.weights.items()}
-            facts["best"] = {"score": self.best.score, "shepherd_steps": self.best.shepherd_steps}
+        for file, kept in self.chosen.items():
+            key = Path(file).stem
+            arrays |= {f"{key}/{name}": array for name, array in kept.weights.items()}
+            facts[key] = {"score": kept.score, "shepherd_steps": kept.shepherd_steps}
         checkpoints.save(self._folder / CHECKPOINTS, Checkpoint(self.number, arrays, facts))
         self._export()
 
     def _export(self) -> None:
-        """Write the latest policy and the best one."""
+        """Write the latest policy and those that were picked."""
         learner = self._learner
         to_policy(learner.model, spec_of(learner.preset, learner.shepherd_steps), self._folder / POLICY)
-        if self.best is not None:
-            spec = spec_of(learner.preset, self.best.shepherd_steps)
-            write_policy(self._folder / BEST, spec, self.best.weights)
+        for file, kept in self.chosen.items():
+            write_policy(self._folder / file, spec_of(learner.preset, kept.shepherd_steps), kept.weights)
 
     def _tell(self, validation: Sequence[Mapping[str, Any]]) -> None:
         steps = self._learner.shepherd_steps
@@ -191,24 +207,41 @@ class _Run:
         self._report(Progress(steps, self._learner.preset.budget, rate, self._measures, validation))
 
 
-def _best_of(saved: Checkpoint) -> Best | None:
-    if "best" not in saved.facts:
-        return None
-    weights = {name.removeprefix("best/"): a for name, a in saved.arrays.items() if name.startswith("best/")}
-    return Best(float(saved.facts["best"]["score"]), int(saved.facts["best"]["shepherd_steps"]), weights)
+def _chosen_of(saved: Checkpoint) -> dict[str, Chosen]:
+    chosen = {}
+    for file in (BEST, FIRST):
+        key = Path(file).stem
+        if key in saved.facts:
+            own = {name: array for name, array in saved.arrays.items() if name.startswith(f"{key}/")}
+            weights = {name.removeprefix(f"{key}/"): array for name, array in own.items()}
+            facts = saved.facts[key]
+            chosen[file] = Chosen(float(facts["score"]), int(facts["shepherd_steps"]), weights)
+    return chosen
 
 
 class _Clock:
-    """Wall-clock time of a run over all its processes, and the pace of this one."""
+    """Wall-clock time that a run has trained over all its processes, and the pace of this one."""
 
     def __init__(self, seconds: float, shepherd_steps: int) -> None:
         self._before, self._steps = seconds, shepherd_steps
         self._began = time.monotonic()
 
+    def _here(self) -> float:
+        return time.monotonic() - self._began
+
     def seconds(self) -> float:
         """Since the run began [s]."""
-        return round(self._before + time.monotonic() - self._began, 3)
+        return round(self._before + self._here(), 3)
 
     def rate(self, shepherd_steps: int) -> float:
         """Shepherd-steps a second."""
-        return (shepherd_steps - self._steps) / max(time.monotonic() - self._began, 1e-9)
+        return (shepherd_steps - self._steps) / max(self._here(), 1e-9)
+
+    @contextmanager
+    def stopped(self) -> Iterator[None]:
+        """While something is done that is not training."""
+        at = time.monotonic()
+        try:
+            yield
+        finally:
+            self._began += time.monotonic() - at

@@ -93,6 +93,11 @@ class Validator:
         delivered = float(np.mean([row["in_goal_end"] for row in rows]))
         return delivered - self._settings.path_cost * float(np.mean([row["path_length"] for row in rows]))
 
+    def passes(self, rows: list[dict[str, Any]]) -> bool:
+        """Whether every point has reached what the preset asks for, if it asks for something."""
+        wanted = self._settings.passes
+        return wanted is not None and all(row["in_goal_end"] >= wanted for row in rows)
+
 
 @contextmanager
 def validator(preset: Preset, n_workers: int) -> Iterator[Validator]:

@@ -1,0 +1,125 @@
+"""Learning curves as rows of ``figure1.csv``, and when they level off.
+
+An **evaluation** is the mean reward of the whole episodes that ended in one rollout. A curve **levels off** at the
+first evaluation after which it, averaged over the last `WINDOW` evaluations and over seeds, stays within `BAND` of its
+range from its final value.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .summary import BOOTSTRAP_SEED, LEVEL, RESAMPLES
+
+Floats = NDArray[np.float64]
+Row = Mapping[str, Any]
+
+COLUMNS = (
+    "recipe", "reward", "seed", "rollout", "shepherd_steps", "decisions", "seconds", "episode_reward", "in_goal_end",
+    "path_length",
+)  # fmt: skip
+"""Of ``figure1.csv``, one row an evaluation; ``rollout`` aligns the seeds of a scheme."""
+WINDOW = 5
+"""Evaluations over which a curve is averaged."""
+BAND = 0.05
+"""Of the range of the averaged curve."""
+
+
+class Curve(NamedTuple):
+    """The curves of one scheme's seeds, at the evaluations that all of them have."""
+
+    seeds: tuple[int, ...]
+    steps: Floats
+    """(E,) shepherd-steps, mean over seeds."""
+    values: Floats
+    """(n_seeds, E)."""
+
+
+def curve_of(rows: Iterable[Row], recipe: str, reward: str, measure: str = "episode_reward") -> Curve:
+    """The curves of a recipe and a reward scheme; without seeds where there are no rows of them.
+
+    Args:
+        rows: of ``figure1.csv``, in any order; a measure may be None.
+        recipe: e.g. "fast".
+        reward: name of the scheme.
+        measure: the column.
+    """
+    found: dict[int, dict[int, tuple[float, float]]] = {}
+    for row in rows:
+        if (row["recipe"], row["reward"]) == (recipe, reward):
+            own = found.setdefault(int(row["seed"]), {})
+            if row[measure] is not None and math.isfinite(row[measure]):
+                own[int(row["rollout"])] = float(row["shepherd_steps"]), float(row[measure])
+    seeds = tuple(sorted(found))
+    shared = sorted(set.intersection(*(set(found[seed]) for seed in seeds))) if seeds else []
+    both = np.array([[found[seed][rollout] for rollout in shared] for seed in seeds], dtype=np.float64)
+    both = both.reshape(len(seeds), len(shared), 2)
+    steps = both[:, :, 0].mean(axis=0) if seeds else np.zeros(0)
+    return Curve(seeds, steps, both[:, :, 1])
+
+
+def averaged(curves: Floats) -> Floats:
+    """(m, E - WINDOW + 1) means of each of m curves (m, E) over the last `WINDOW` evaluations."""
+    n = curves.shape[1] - WINDOW + 1
+    total = np.zeros((len(curves), n))
+    for k in range(WINDOW):
+        total += curves[:, k : k + n]
+    return total / WINDOW
+
+
+def level_off(curves: Floats) -> NDArray[np.intp]:
+    """(m,) index of the evaluation at which each of m curves (m, E), E >= `WINDOW`, levels off.
+
+    The earliest is `WINDOW` - 1, the first for which there is an average.
+    """
+    means = averaged(curves)
+    band = BAND * (means.max(axis=1) - means.min(axis=1))
+    outside = np.abs(means - means[:, -1:]) > band[:, None] + 1e-12
+    # one after the last that lies outside; the final one never does
+    last = means.shape[1] - 1 - np.argmax(outside[:, ::-1], axis=1)
+    return np.asarray(np.where(outside.any(axis=1), last + 1, 0) + WINDOW - 1)
+
+
+def later_by(curve: Curve, other: Curve) -> tuple[float, float, float]:
+    """Shepherd-steps by which a curve levels off later than another, with a 95 % bootstrap percentile interval.
+
+    Seeds are resampled, those of the two curves independently: runs of equal seed have nothing in common but worlds
+    that they soon lead elsewhere.
+
+    Args:
+        curve: of at least one seed and `WINDOW` evaluations.
+        other: likewise.
+
+    Returns:
+        value, low, high.
+    """
+    rng = np.random.default_rng(BOOTSTRAP_SEED)
+    value, resampled = 0.0, np.zeros(RESAMPLES)
+    for sign, own in ((1.0, curve), (-1.0, other)):
+        value += sign * float(own.steps[level_off(own.values.mean(axis=0)[None])[0]])
+        chosen = rng.integers(len(own.seeds), size=(RESAMPLES, len(own.seeds)))
+        means = np.zeros((RESAMPLES, own.values.shape[1]))
+        for k in range(len(own.seeds)):
+            means += own.values[chosen[:, k]]
+        resampled += sign * own.steps[level_off(means / len(own.seeds))]
+    tail = 50.0 * (1.0 - LEVEL)
+    low, high = np.percentile(resampled, [tail, 100.0 - tail])
+    return value, float(low), float(high)
+
+
+def levels_off_at(curve: Curve) -> float | None:
+    """Shepherd-steps at which the mean over seeds levels off; None: not `WINDOW` evaluations before its end."""
+    if len(curve.steps) <= WINDOW:
+        return None
+    at = int(level_off(curve.values.mean(axis=0)[None])[0])
+    return float(curve.steps[at]) if at < len(curve.steps) - WINDOW else None
+
+
+def final_value(curve: Curve) -> float | None:
+    """Mean of the last `WINDOW` evaluations over seeds; None where there are none."""
+    return float(curve.values[:, -WINDOW:].mean()) if curve.values.size else None

@@ -1,0 +1,102 @@
+"""Which runs the experiments about learning consist of: figure 1, and what each ingredient of `fast` buys."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from shepherd_phys.learning.preset import Preset, Validation, load_preset
+
+FIRST_SEED = 1_000_000
+"""Of training; run k of a scheme has this plus k."""
+HOME = 97.0
+"""Sheep delivered with each of 1 to 5 flocks at which a policy counts as bringing them home [%]."""
+FIGURE1 = Validation(flocks=(1, 2, 3, 4, 5), trials=20)
+PAPER_EVERY = 5
+"""Checkpoints of `paper` from one validation to the next: it is slow, and so are its episodes."""
+ABLATIONS = Validation(flocks=(1, 2, 5), trials=20, every=1_000_000)  # none but the last, which every run has
+
+
+class Run(NamedTuple):
+    """A training run of an experiment."""
+
+    name: str
+    """Of its folder."""
+    recipe: str
+    """The preset that it is, or the variant of one."""
+    preset: Preset
+    hours: float = math.inf
+    """Of training, after which it ends though its budget is not spent."""
+
+
+def figure1(n_seeds: int, budget: int, paper_hours: float) -> list[Run]:
+    """The runs of figure 1 in the order in which they are wanted: wild first, the paper's recipe last.
+
+    Args:
+        n_seeds: runs of each scheme.
+        budget: shepherd-steps of each.
+        paper_hours: of the one run of preset `paper`; 0: none.
+    """
+    fast = load_preset("fast").but(budget=budget, validation=FIGURE1.but(passes=HOME))
+    runs = [
+        Run(f"{reward}-{seed}", "fast", fast.but(reward=reward, seed=seed))
+        for reward in ("wild", "any", "original")
+        for seed in range(FIRST_SEED, FIRST_SEED + n_seeds)
+    ]
+    if paper_hours:
+        paper = load_preset("paper").but(seed=FIRST_SEED, validation=FIGURE1.but(every=PAPER_EVERY))
+        runs.append(Run(f"paper-{paper.reward}-{paper.seed}", "paper", paper, paper_hours))
+    return runs
+
+
+def ablations(n_seeds: int, budget: int) -> list[Run]:
+    """The runs of the ablations, seed by seed, so that an unfinished study knows something about every variant.
+
+    Args:
+        n_seeds: runs of each variant.
+        budget: shepherd-steps of each.
+    """
+    return [
+        Run(f"ablation-{name}-{seed}", name, preset.but(seed=seed, budget=budget, validation=ABLATIONS))
+        for seed in range(FIRST_SEED, FIRST_SEED + n_seeds)
+        for name, preset in variants().items()
+    ]
+
+
+def variants() -> dict[str, Preset]:
+    """What is compared, by name: `fast` less one ingredient each, and `paper` with one more after another.
+
+    All of them observe 64 sectors, by the network that goes with them.
+    """
+    fast = load_preset("fast")
+    found = {
+        "fast": fast,
+        "fast-world-frame": fast.but(lidar=fast.lidar.but(frame="world")),
+        "fast-team-credit": fast.but(credit="team"),
+        "fast-own-critic": fast.but(critic_sees="own"),
+        "fast-every-step": deciding_every(fast, 1),
+        "fast-alpha-0": fast.but(alpha=0.0),
+    }
+    paper = load_preset("paper")
+    added = paper.but(lidar=paper.lidar.but(sectors=fast.lidar.sectors), network=fast.network)
+    found["paper-64"] = added
+    added = added.but(lidar=added.lidar.but(frame=fast.lidar.frame))
+    found["paper-64-frame"] = added
+    added = added.but(credit=fast.credit)
+    found["paper-64-frame-credit"] = added
+    added = added.but(critic_sees=fast.critic_sees)
+    found["paper-64-frame-credit-critic"] = added
+    # PPO's settings stay the paper recipe's, which count decisions: the last ingredient is the interval with all that
+    # it brings, a longer rollout and a longer sight among them
+    found["paper-64-frame-credit-critic-interval"] = added.but(decision_interval=fast.decision_interval)
+    return found
+
+
+def deciding_every(preset: Preset, interval: int) -> Preset:
+    """A preset that decides every so many control steps, with the same discount a second and as long a rollout.
+
+    The rollout's length is rounded to whole decisions; the batch holds as many decisions as before.
+    """
+    longer = interval / preset.decision_interval
+    ppo = preset.ppo.but(gamma=preset.ppo.gamma**longer, n_steps=max(1, round(preset.ppo.n_steps / longer)))
+    return preset.but(decision_interval=interval, ppo=ppo)

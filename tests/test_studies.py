@@ -1,0 +1,244 @@
+"""``reproduce figure1`` and ``ablations`` with runs of a few rollouts: folders, continuing, tables, time to home."""
+
+import csv
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import tomli_w
+from test_learning import TINY
+
+from shepherd_phys.controllers import load_policy
+from shepherd_phys.controllers.curves import COLUMNS
+from shepherd_phys.learning import studies
+from shepherd_phys.learning.studies import Run
+from shepherd_phys.scripts import main, reproduce, train
+from shepherd_phys.scripts.curves import VALIDATIONS, read_rows
+from shepherd_phys.scripts.learning_pages import ablations_page, figure1_page
+from shepherd_phys.scripts.studies import HOME_COLUMNS
+
+pytest.importorskip("matplotlib")
+
+# 3 slots x 8 decisions x 5 control steps = 120 shepherd-steps a rollout, two rollouts a checkpoint
+QUICK = TINY.but(scenario=TINY.scenario.but(n_steps=30), checkpoint_rollouts=2)
+JUDGED = QUICK.validation.but(flocks=(1, 2), passes=0.1)
+
+
+def runs(n_seeds, budget, paper_hours=0.0):
+    """Runs of wild and any and one of a paper's recipe, as `shepherd_phys.learning.studies.figure1` makes them."""
+    fast = QUICK.but(budget=budget, validation=JUDGED)
+    made = [
+        Run(f"{reward}-{k}", "fast", fast.but(reward=reward, seed=k))
+        for reward in ("wild", "any")
+        for k in range(n_seeds)
+    ]
+    paper = QUICK.but(budget=10**9, seed=7, validation=JUDGED.but(passes=None))
+    return made + ([Run("paper-wild-7", "paper", paper, paper_hours)] if paper_hours else [])
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    (tmp_path / "tiny.toml").write_text(tomli_w.dumps({"n_sheep": 6, "n_flocks": 2, "shepherds": 2, "n_steps": 6}))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(reproduce, "SCENARIO", "tiny.toml")
+    monkeypatch.setitem(reproduce.LEAST, "workers", 0)
+    monkeypatch.setattr(studies, "figure1", runs)
+    monkeypatch.setattr(studies, "FIGURE1", JUDGED)
+    monkeypatch.setattr("shepherd_phys.learning.validation.Validator.passes", lambda self, rows: True)
+    monkeypatch.setattr("shepherd_phys.scripts.studies.HOME", 0.0)
+    return tmp_path
+
+
+def figure1(*words, budget=480):
+    command = ["reproduce", "figure1", "--seeds", "1", "--budget", str(budget), "--trials", "2", "--workers", "0"]
+    return main.main([*command, "--paper-hours", "0", "--out", "o", *words])
+
+
+def read(name):
+    with open(Path("o") / name, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_figure_1_from_nothing_and_again(folder, capsys, monkeypatch):
+    assert figure1("--json") == 0
+    said = capsys.readouterr()
+    assert sorted(path.name for path in Path("o/training").iterdir()) == ["any-0", "wild-0"]
+    for name in ("preset.toml", "curve.csv", "validation.csv", "checkpoints", "policy.json", "first.json"):
+        assert Path("o/training/wild-0", name).exists()
+    files = ["claims.json", "claims.md", "figure1-validation.csv", "figure1.csv", "figure1.md", "figure1.png",
+             "time-to-home.csv"]  # fmt: skip
+    assert sorted(path.name for path in Path("o").iterdir() if path.suffix in {".csv", ".md", ".png", ".json"}) == files
+
+    curves = read_rows(Path("o/figure1.csv"), COLUMNS)
+    assert tuple(read("figure1.csv")[0]) == COLUMNS
+    assert [row["reward"] for row in curves] == sorted((row["reward"] for row in curves), reverse=True)  # wild first
+    for reward in ("wild", "any"):
+        own = [row for row in curves if row["reward"] == reward]
+        last = read(f"training/{reward}-0/curve.csv")[-1]
+        assert own[-1]["shepherd_steps"] == int(last["shepherd_steps"]) >= 480
+        assert own[-1]["decisions"] == int(last["decisions"]) and own[-1]["seconds"] == float(last["seconds"])
+        assert all(row["episode_reward"] is not None for row in own[:-1])
+    checks = read_rows(Path("o/figure1-validation.csv"), VALIDATIONS)
+    assert [(row["checkpoint"], row["n_flocks"]) for row in checks if row["reward"] == "wild"] == [
+        (1, 1), (1, 2), (2, 1), (2, 2),
+    ]  # fmt: skip
+    home = read_rows(Path("o/time-to-home.csv"), HOME_COLUMNS)
+    assert [(row["seed"], row["checkpoint"], row["n_flocks"], row["trials"]) for row in home] == [
+        (0, 1, 1, 2),
+        (0, 1, 2, 2),
+    ]
+    (reached,) = {row["shepherd_steps"] for row in home}
+    assert load_policy("o/training/wild-0/first.json").spec.training["shepherd_steps"] == reached
+    assert all(0 <= row["confirmed_low"] <= row["confirmed_mean"] <= row["confirmed_high"] <= 100 for row in home)
+    assert {row["seconds"] for row in home} == {row["seconds"] for row in checks[:2]}
+    assert Path("o/figure1.md").read_text("utf-8") == figure1_page(curves, checks, home)
+    told = json.loads(said.out)
+    assert told["time_to_home"] == home and told["claims"] == json.loads(Path("o/claims.json").read_text("utf-8"))
+    assert [claim["claim"] for claim in told["claims"]["claims"]] == [f"c{i}" for i in range(1, 9)]
+    assert told["claims"]["claims"][-1]["parts"][0]["note"] == "fewer than 3 seeds"
+    assert "wild-0: validation at" in said.err
+
+    before = {path.name: path.read_bytes() for path in Path("o").iterdir() if path.suffix in {".csv", ".md", ".json"}}
+    monkeypatch.setattr("shepherd_phys.scripts.curves._train", None)  # nothing is left to be trained, or played
+    monkeypatch.setattr("shepherd_phys.campaign.attempt", None)
+    monkeypatch.setattr(train, "LIBRARIES", ("no_such_library",))  # nor is a library needed
+    assert figure1() == 0
+    assert {name: Path("o", name).read_bytes() for name in before} == before
+    assert "| fast | wild | 1 |" in capsys.readouterr().out
+
+
+def test_figure_1_goes_on_after_a_stop_and_becomes_longer(folder, capsys, monkeypatch):
+    def stop(now):
+        if now.validation:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("shepherd_phys.scripts.curves._teller", lambda name: stop)
+        assert figure1("--paper-hours", "1e-9", budget=240) == 130
+    assert "stopped; the runs are kept in o/training: the same command continues" in capsys.readouterr().err
+    assert [path.name for path in Path("o/training").iterdir()] == ["wild-0"]
+    assert not Path("o/figure1.csv").exists()
+    assert figure1("--paper-hours", "1e-9", budget=240) == 0
+    short = read_rows(Path("o/figure1.csv"), COLUMNS)
+    assert {row["recipe"] for row in short} == {"fast", "paper"}
+    assert len(read("training/paper-wild-7/curve.csv")) == 1  # its time was over at once
+    assert [row["checkpoint"] for row in read("training/paper-wild-7/validation.csv")] == ["1", "1"]
+    assert figure1(budget=480) == 0
+    assert max(row["shepherd_steps"] for row in read_rows(Path("o/figure1.csv"), COLUMNS)) >= 480
+    assert figure1("--paper-hours", "1e-9", budget=240) == 0  # and a shorter look at the longer runs
+    assert read_rows(Path("o/figure1.csv"), COLUMNS) == short
+
+
+def test_a_folder_with_other_settings_is_left_alone(folder, capsys):
+    (run,) = runs(1, 240)[:1]
+    Path("o/training/wild-0").mkdir(parents=True)
+    run.preset.but(worlds=1, team_sizes=(3,)).to_toml("o/training/wild-0/preset.toml")
+    before = Path("o/training/wild-0/preset.toml").read_bytes()
+    assert figure1(budget=240) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "o/training/wild-0: holds a run with other settings; another --out begins anew" in line
+    assert Path("o/training/wild-0/preset.toml").read_bytes() == before
+
+
+def test_without_the_libraries_nothing_is_begun(folder, capsys, monkeypatch):
+    monkeypatch.setattr(train, "LIBRARIES", ("torch", "no_such_library"))
+    assert figure1() == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line == "shepherd-phys reproduce: no_such_library is missing: pip install 'shepherd-phys[train]'"
+    assert not Path("o").exists()
+
+
+def test_broken_claims_are_one_line(folder, capsys):
+    Path("o").mkdir()
+    Path("o/claims.json").write_text('{"claims": 3}')
+    assert figure1() == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "o/claims.json: is not what reproduce writes" in line
+
+
+def test_a_run_that_fails_is_named_and_the_others_go_on(folder, capsys, monkeypatch):
+    from shepherd_phys.learning import run
+    from shepherd_phys.learning.ppo import TrainingError
+
+    real = run.train
+
+    def fails(place, *more):
+        if place.name == "wild-0":
+            raise TrainingError("rewards: holds a NaN or an infinity: training stops")
+        return real(place, *more)
+
+    monkeypatch.setattr(run, "train", fails)
+    assert figure1(budget=120) == 1
+    assert "shepherd-phys reproduce: wild-0: rewards: holds a NaN" in capsys.readouterr().err
+    assert {row["reward"] for row in read("figure1.csv")} == {"any"}
+    assert read("time-to-home.csv") == []
+
+
+def test_the_other_figures_judge_the_curves_that_are_there(folder, capsys):
+    curves = [
+        {"recipe": "fast", "reward": reward, "seed": seed, "rollout": k, "shepherd_steps": k * 1000, "decisions": k,
+         "seconds": 1.0, "episode_reward": float(k > at), "in_goal_end": 0.0, "path_length": 0.0}
+        for reward, at in (("wild", 5), ("any", 15))
+        for seed in range(3)
+        for k in range(1, 31)
+    ]  # fmt: skip
+    Path("o").mkdir()
+    with open("o/figure1.csv", "w", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS)
+        writer.writeheader()
+        writer.writerows(curves)
+    command = ["reproduce", "figure2", "--controllers", "idle", "--trials", "1", "--workers", "0", "--out", "o"]
+    assert main.main(command) == 0
+    report = json.loads(Path("o/claims.json").read_text("utf-8"))
+    assert report["claims"][-1]["verdict"] == "holds"
+    assert "recipe fast" in Path("o/claims.md").read_text("utf-8")
+    capsys.readouterr()
+    Path("o/figure1.csv").write_text("recipe,reward\nfast,wild\n")
+    assert main.main(command) == 2
+    assert "o/figure1.csv: is not the table that it should be" in capsys.readouterr().err
+
+
+DRIVER = """
+import sys
+from test_studies import QUICK
+from shepherd_phys.learning import studies
+from shepherd_phys.scripts import main
+kinds = {"base": QUICK, "base-team-credit": QUICK.but(credit="team")}
+studies.variants = lambda: kinds
+studies.ABLATIONS = QUICK.validation.but(every=1_000_000)
+if __name__ == "__main__":
+    sys.exit(main.main(sys.argv[1:]))
+"""
+
+
+def test_the_ablations_in_a_shell(tmp_path):
+    (tmp_path / "driver.py").write_text(DRIVER)
+    words = ["reproduce", "ablations", "--seeds", "1", "--budget", "480", "--workers", "2", "--out", "o"]
+    done = subprocess.run(
+        [sys.executable, "driver.py", *words],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)},
+        capture_output=True,
+        text=True,
+        timeout=400,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    out = tmp_path / "o"
+    names = ["ablation-base-1000000", "ablation-base-team-credit-1000000"]
+    assert sorted(path.name for path in (out / "training").iterdir()) == names
+    curves = read_rows(out / "ablations.csv", COLUMNS)
+    assert list(dict.fromkeys((row["recipe"], row["seed"]) for row in curves)) == [
+        ("base", 1_000_000),
+        ("base-team-credit", 1_000_000),
+    ]
+    checks = read_rows(out / "ablations-validation.csv", VALIDATIONS)
+    assert [(row["recipe"], row["n_flocks"]) for row in checks] == [("base", 1), ("base-team-credit", 1)]  # at the end
+    page = ablations_page(curves, checks)
+    assert (out / "ablations.md").read_text("utf-8") == page
+    assert done.stdout.startswith(page) and done.stdout.splitlines()[-1] == "o/ablations.png"
+    assert (out / "ablations.png").read_bytes().startswith(b"\x89PNG")
+    assert "ablation-base-1000000: validation at" in done.stderr
