@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import numbers
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -184,9 +185,11 @@ class Scenario(Settings):
 SCENARIOS: dict[str, Scenario] = {
     "paper": Scenario(),
     "single": Scenario(n_flocks=1),
+    "double": Scenario(n_sheep=200, goal_radius=2.5 * math.sqrt(2.0)),
     "small": Scenario(n_sheep=20, n_flocks=2, shepherds=2, flock=Strombom(n_neighbours=8), n_steps=500),
 }
-"""Presets by name: the paper's world; one flock; a small one for quick looks."""
+"""Presets by name: the paper's world; one flock; twice the sheep with a goal of twice the area; a small one for quick
+looks."""
 
 
 def load_scenario(name_or_path: str | Path, classes: Iterable[Any] = ()) -> Scenario:
