@@ -38,16 +38,17 @@ class Term(Protocol):
 
 
 @numba.njit(cache=True)
-def _occluding(sheep: Floats, goal: Floats, alpha: float, influence: float) -> Floats:
-    """Beams (P,) with the sheep's reading (P, B) in [alpha, min(goal's, influence)]; nothing seen reads infinity."""
-    counts = np.zeros(len(sheep))
+def _occluding(sheep: Floats, goal: Floats, alpha: float, influence: float, n_steps: int, shares: Floats) -> None:
+    """Write the beams (P,) with the sheep's reading (P, B) in [alpha, min(goal's, influence)], over the steps.
+
+    Nothing seen reads infinity.
+    """
     for p in range(len(sheep)):
         count = 0
         for b in range(sheep.shape[1]):
             s, g = sheep[p, b], goal[p, b]
             count += 1 if (s >= alpha) & (s <= influence) & (s <= g) & (g < np.inf) else 0
-        counts[p] = count
-    return counts
+        shares[p] = count / n_steps
 
 
 @settings
@@ -104,7 +105,8 @@ class Occlusion(Settings):
         if scan is None:
             raise ValueError("the occlusion term needs a scan")
         seen, goal = self.scans
-        counted: Floats = _occluding(scan[seen], scan[goal], self.alpha, self.influence) / scenario.n_steps
+        counted = np.empty(after.n_shepherds)
+        _occluding(scan[seen], scan[goal], self.alpha, self.influence, scenario.n_steps, counted)
         return counted
 
     def __call__(self, before: WorldState, after: WorldState, scan: Scan | None, scenario: Scenario) -> float:

@@ -1,4 +1,7 @@
-"""Kernels between a scan and an observation: plain arrays in, plain arrays out."""
+"""Kernels between a scan and an observation: plain arrays in, plain arrays out.
+
+They write into arrays that they are given: to bring a new one back from compiled code costs more than the work.
+"""
 
 from __future__ import annotations
 
@@ -14,53 +17,49 @@ Ints = NDArray[np.int64]
 
 
 @njit(cache=True, error_model="numpy")
-def proximities(ranges: Floats, n_channels: int, goal_row: int, reach: float, goal_reach: float) -> Any:
-    """Proximities 1 - d/range, (P, n_channels, beams) float32, of the first readings (>= n_channels, P, beams) [m]."""
-    n_shepherds, beams = ranges.shape[1], ranges.shape[2]
-    out = np.empty((n_shepherds, n_channels, beams), np.float32)
+def proximities(ranges: Floats, goal_row: int, reach: float, goal_reach: float, out: Any) -> None:
+    """Write proximities 1 - d/range (P, channels, beams) of the first readings (>= channels, P, beams) [m]."""
+    n_shepherds, n_channels, beams = out.shape
     for c in range(n_channels):
         full = goal_reach if c == goal_row else reach
         for p in range(n_shepherds):
             for k in range(beams):
                 near = 1.0 - ranges[c, p, k] / full
                 out[p, c, k] = near if near > 0.0 else 0.0
-    return out
 
 
 @njit(cache=True, error_model="numpy")
-def goal_offsets(goal: Any, last: Ints, directions: Floats) -> Ints:
-    """Beam nearest to the circular mean of the lit goal beams, (P,).
+def goal_offsets(rows: Any, row: int, directions: Floats, offsets: Ints) -> None:
+    """Find the beam nearest to the circular mean of the lit goal beams.
 
     Args:
-        goal: (P, beams) proximities of the goal, 0 where it is not seen.
-        last: (P,) kept where nothing is lit, or more than half of the beams: from outside the goal at most
-            half of them can be.
+        rows: (P, R, beams) proximities, 0 where nothing is seen.
+        row: which of the R reads the goal.
         directions: (2, 2 beams).
+        offsets: (P,) overwritten, but kept where nothing is lit, or more than half of the beams: from outside the goal
+            at most half of them can be.
     """
-    n, beams = goal.shape
-    offsets = last.copy()
+    n, _, beams = rows.shape
     for p in range(n):
         cx, cy, lit = 0.0, 0.0, 0
         for k in range(beams):
-            if goal[p, k] > 0.0:
+            if rows[p, row, k] > 0.0:
                 lit += 1
                 cx += directions[0, k]
                 cy += directions[1, k]
         if lit > 0 and 2 * lit <= beams and math.hypot(cx, cy) > 1e-9:
             offsets[p] = int(np.rint(math.atan2(cy, cx) * beams / (2.0 * math.pi))) % beams
-    return offsets
 
 
 @njit(cache=True, error_model="numpy")
-def rolled_sectors(rows: Any, offsets: Ints, sectors: int) -> Any:
-    """Rows (P, R, beams) float32 rolled so that beam ``offsets[p]`` comes first; the greatest of each sector.
+def rolled_sectors(rows: Any, offsets: Ints, out: Any) -> None:
+    """Roll rows (P, R, beams) float32 so that beam ``offsets[p]`` comes first, and write the greatest of each sector.
 
-    Returns:
-        (P, R, sectors) float32; sector j holds beams s j - s // 2 .. of the rolled row, s = beams / sectors.
+    ``out`` is (P, R, sectors) float32; sector j holds beams s j - s // 2 .. of the rolled row, s = beams / sectors.
     """
     n, n_rows, beams = rows.shape
+    sectors = out.shape[2]
     size = beams // sectors
-    out = np.empty((n, n_rows, sectors), np.float32)
     for p in range(n):
         start = (offsets[p] - size // 2) % beams
         for i in range(n_rows):
@@ -74,4 +73,3 @@ def rolled_sectors(rows: Any, offsets: Ints, sectors: int) -> Any:
                     best = rows[p, i, k] if rows[p, i, k] > best else best
                 out[p, i, j] = best
                 low = high if high < beams else high - beams
-    return out

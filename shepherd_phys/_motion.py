@@ -62,9 +62,15 @@ def servo(rows, command, mass, moment, h, limit, spin_limit, spins, force):  # t
 @numba.njit(cache=True)
 def measure(  # type: ignore[no-untyped-def]
     rows, command, heading, arrived, previous, path, goal, goal_radius,
-    pos, vel, turned, distance, inside, ever, at, at_vel, angle, walked, poses,
+    sheep, distance, known, shepherds, lengths, poses,
 ):  # fmt: skip
-    """Write positions, velocities, headings, distances to the goal, who is in it, what shepherds walked; all finite?"""
+    """Write what a state holds; whether all is finite.
+
+    ``sheep`` (3, N, 2) positions, velocities, headings; ``distance`` (N,) to the goal; ``known`` (2, N) in the goal now
+    and ever; ``shepherds`` (2, P, 2) positions, velocities; ``lengths`` (2, P) angles, ways walked; ``poses`` of all.
+    """
+    pos, vel, turned, inside, ever = sheep[0], sheep[1], sheep[2], known[0], known[1]
+    at, at_vel, angle, walked = shepherds[0], shepherds[1], lengths[0], lengths[1]
     n, p = len(pos), len(at)
     spins = rows.shape[1] == 6
     v = 3 if spins else 2

@@ -293,7 +293,8 @@ def encode(scan: Scan, lidar: Lidar) -> Proximities:
         nothing = np.full(ranges.shape[1:], np.inf)
         ranges = frozen(np.array([scan[name] if name in scan.names else nothing for name in channels]))
     goal_row = channels.index("goal") if "goal" in channels else -1
-    encoded: Proximities = _frames.proximities(ranges, len(channels), goal_row, lidar.range, lidar.goal_range)
+    encoded: Proximities = np.empty((ranges.shape[1], len(channels), ranges.shape[2]), np.float32)
+    _frames.proximities(ranges, goal_row, lidar.range, lidar.goal_range, encoded)
     return encoded
 
 
@@ -322,7 +323,7 @@ class Stack:
 
     def offset(self, last: NDArray[np.int64]) -> NDArray[np.int64]:
         """The beam offsets (P,) that `observe` would answer, in the goal frame, without an observation."""
-        return _goal_offsets(self._frames[-1], last, self._lidar)
+        return _goal_offsets(self._frames[-1], 0, last, self._lidar)
 
     def observe(self, offset: NDArray[np.int64]) -> tuple[Proximities, NDArray[np.int64]]:
         """`observe` of the frames, without its copy."""
@@ -362,22 +363,24 @@ def _observe(stack: Proximities, offset: NDArray[np.int64], lidar: Lidar) -> tup
         rows = stack.reshape(-1, n_frames * n_channels, beams)
         offset = np.ascontiguousarray(offset)
         if lidar.frame == "goal":
-            newest = rows[:, (n_frames - 1) * n_channels :]
-            offset = _goal_offsets(newest, offset.reshape(-1), lidar).reshape(offset.shape)
+            newest = (n_frames - 1) * n_channels
+            offset = _goal_offsets(rows, newest, offset.reshape(-1), lidar).reshape(offset.shape)
             turns = offset.reshape(-1)
         else:
             turns = np.zeros(len(rows), np.int64)
-        rows = _frames.rolled_sectors(rows, turns, columns)
+        grouped = np.empty((*rows.shape[:2], columns), np.float32)
+        _frames.rolled_sectors(rows, turns, grouped)
+        rows = grouped
     if lidar.layout == "paper":
         framed = rows.reshape(*teams, n_frames, n_channels * columns)
         return np.ascontiguousarray(np.moveaxis(framed, -2, -1))[..., None, :], offset
     return rows.reshape(*teams, n_frames * n_channels, columns), offset
 
 
-def _goal_offsets(frame: Proximities, last: NDArray[np.int64], lidar: Lidar) -> NDArray[np.int64]:
-    """The beam offsets (P,) after a frame (P, channels, beams)."""
-    goal = np.ascontiguousarray(frame[:, lidar.channels.index("goal")])
-    offsets: NDArray[np.int64] = _frames.goal_offsets(goal, last, beam_directions(lidar.beams))
+def _goal_offsets(rows: Proximities, first: int, last: NDArray[np.int64], lidar: Lidar) -> NDArray[np.int64]:
+    """The beam offsets (P,) after a frame: the channels in ``rows`` (P, R, beams) from the ``first`` one on."""
+    offsets = last.copy()
+    _frames.goal_offsets(rows, first + lidar.channels.index("goal"), beam_directions(lidar.beams), offsets)
     return offsets
 
 
@@ -386,5 +389,7 @@ def turn(action: NDArray[Any], offset: NDArray[np.int64], beams: int) -> NDArray
     angle = (2.0 * np.pi / beams) * offset
     ca, sa = np.cos(angle), np.sin(angle)
     x, y = action[..., 0], action[..., 1]
-    turned = np.stack((ca * x - sa * y, sa * x + ca * y), axis=-1)
-    return turned.astype(np.result_type(action.dtype, np.float32), copy=False)
+    turned = np.empty(action.shape, np.result_type(action.dtype, np.float32))
+    turned[..., 0] = ca * x - sa * y
+    turned[..., 1] = sa * x + ca * y
+    return turned

@@ -1,13 +1,12 @@
 """`World`: owns the pymunk Space; reset, step, state, scan.
 
-Speed comes from crossing between Python and C few times: one batch write and one batch read an engine step,
-one compiled call for the flock, one for the servo, one for the measures of the new state, one for all scans.
+Speed comes from crossing between Python and C few times: one compiled call for the flock, one for the servo and the
+engine steps, one for the measures of the new state, one for all scans.
 """
 
 from __future__ import annotations
 
 import math
-import weakref
 from collections import Counter
 from collections.abc import Mapping
 from typing import Any
@@ -15,9 +14,9 @@ from typing import Any
 import numpy as np
 import pymunk
 from numpy.typing import ArrayLike, NDArray
-from pymunk import batch
 
 from shepherd_phys import _motion
+from shepherd_phys._engine import Engine
 from shepherd_phys.bodies import Disc, built
 from shepherd_phys.geometry import (
     OBSTACLE_CATEGORY,
@@ -52,18 +51,6 @@ below, though it is faster there, too: its segment queries lose a beam that runs
 the reference lidar is made of them."""
 HASH_CELL = 4.7
 """Side of a cell of that hash over the radius of a body (measured: flat from 3 to 7)."""
-
-_LINEAR = batch.BodyFields.POSITION | batch.BodyFields.VELOCITY
-_POSES = _LINEAR | batch.BodyFields.ANGLE | batch.BodyFields.ANGULAR_VELOCITY
-
-
-_SPARE_BUFFERS: list[tuple[batch.Buffer, batch.Buffer]] = []
-"""pymunk never frees a batch buffer: a world uses its two for every Space, and leaves them here for another world."""
-
-
-def _buffers() -> tuple[batch.Buffer, batch.Buffer]:
-    """A buffer to read and one to write, which nobody else uses."""
-    return _SPARE_BUFFERS.pop() if _SPARE_BUFFERS else (batch.Buffer(), batch.Buffer())
 
 
 class NonFiniteError(FloatingPointError, ValueError):
@@ -327,24 +314,12 @@ class World:
         self._sensors: dict[Lidar, Sensor] = {}
         self._sensor: Sensor | None = None
 
-        # the static body is the last row of every batch once anybody has touched it: do, so that it always is
-        n_rows = len([*bodies, space.static_body])
         self._command = np.zeros((n + p, 3))
         self._poses = np.zeros((n + p, 3))
-        self._force = np.zeros((n_rows, 3 if self._spins else 2))
-        if "_read_buffer" not in self.__dict__:
-            # not before the first reset, so that a fresh world can be pickled
-            self._read_buffer, self._write_buffer = buffers = _buffers()
-            weakref.finalize(self, _SPARE_BUFFERS.append, buffers)
-        self._write_buffer.set_float_buf(self._force)
-        self._fields = _POSES if self._spins else _LINEAR
-        self._force_fields = batch.BodyFields.FORCE | batch.BodyFields.TORQUE if self._spins else batch.BodyFields.FORCE
-
-        # the first read makes pymunk's memory as large as it needs to be; from then on it stays where it is
-        self._read_buffer.clear()
-        batch.get_space_bodies(space, self._fields, self._read_buffer)
-        self._rows: Floats = np.frombuffer(self._read_buffer.float_buf()).reshape(n_rows, 6 if self._spins else 4)
-        rows = self._rows
+        if "_engine" not in self.__dict__:
+            self._engine = Engine()  # not before the first reset, so that a fresh world can be pickled
+        self._engine.bind(space, n + p, self._spins)
+        rows = self._engine.rows
         self._state = self._measure(rows, 0, heading, arrived, rows[n : n + p, :2], np.zeros(p))
         return self._state
 
@@ -361,7 +336,6 @@ class World:
             NonFiniteError: the action, or what the flock model wants, is not finite; nothing has moved.
         """
         state, scenario = self.state, self.scenario
-        space = self.space
         try:
             action = np.asarray(action, dtype=np.float64)
         except (TypeError, ValueError):
@@ -383,29 +357,16 @@ class World:
         if not _motion.command_sheep(wanted, command):
             raise NonFiniteError(f"flock model ({flock}): velocities must be finite")
 
-        h, substeps = self._h, self._substeps
-        rows = self._rows
-        for substep in range(substeps):
-            if self._followers:
-                command = self._follow(rows, h)
-            _motion.servo(
-                rows,
-                command,
-                self._mass,
-                self._moment,
-                h,
-                scenario.max_acceleration,
-                scenario.max_angular_acceleration,
-                self._spins,
-                self._force,
-            )
-            batch.set_space_bodies(space, self._force_fields, self._write_buffer)
-            space.step(h)
-            if substep + 1 < substeps:
-                rows = self._read()
+        limits = scenario.max_acceleration, scenario.max_angular_acceleration
+        if self._followers:
+            for _ in range(self._substeps):
+                followed = self._follow(self._engine.rows, self._h)
+                rows = self._engine.drive(followed, self._mass, self._moment, self._h, 1, *limits)
+        else:
+            rows = self._engine.drive(command, self._mass, self._moment, self._h, self._substeps, *limits)
 
         self._state = self._measure(
-            self._read(),
+            rows,
             state.step + 1,
             state.sheep_heading,
             state.sheep_arrived,
@@ -429,30 +390,22 @@ class World:
                 raise NonFiniteError(f"{name}.follow: velocity and spin must be finite (given: {answer!r})")
         return followed
 
-    def _read(self) -> Floats:
-        """One batch read: (rows, 4) x, y, vx, vy or (rows, 6) x, y, angle, vx, vy, spin; the next one overwrites it."""
-        self._read_buffer.clear()
-        batch.get_space_bodies(self.space, self._fields, self._read_buffer)
-        if len(self._read_buffer.float_buf()) != self._rows.nbytes:  # then pymunk's memory may have moved, too
-            raise RuntimeError("bodies were added to the world's space, or removed: it holds the scenario's alone")
-        return self._rows
-
     def _measure(
         self, rows: Floats, step: int, heading: Floats, arrived: NDArray[np.bool_], previous: Floats, path: Floats
     ) -> WorldState:
         """Make the state of what was read."""
         scenario, n, p = self.scenario, self._n, self._p
         # allocated here and not in the kernel: handing arrays over costs less than bringing them back
-        pos, vel, turned, distance = np.empty((n, 2)), np.empty((n, 2)), np.empty((n, 2)), np.empty(n)
-        inside, ever = np.empty(n, np.bool_), np.empty(n, np.bool_)
-        at, at_vel, angle, walked = np.empty((p, 2)), np.empty((p, 2)), np.empty(p), np.empty(p)
+        sheep, distance, known = np.empty((3, n, 2)), np.empty(n), np.empty((2, n), np.bool_)
+        shepherds, lengths = np.empty((2, p, 2)), np.empty((2, p))
         if not _motion.measure(
             rows, self._command, heading, arrived, previous, path, self._goal, scenario.goal_radius,
-            pos, vel, turned, distance, inside, ever, at, at_vel, angle, walked, self._poses,
+            sheep, distance, known, shepherds, lengths, self._poses,
         ):  # fmt: skip
             raise NonFiniteError("the engine gave positions or velocities that are not finite")
-        for array in (pos, vel, turned, distance, inside, ever, at, at_vel, angle, walked):
+        for array in (sheep, distance, known, shepherds, lengths):
             array.setflags(write=False)
+        (pos, vel, turned), (inside, ever), (at, at_vel), (angle, walked) = sheep, known, shepherds, lengths
         return WorldState.of(
             {
                 **self._constant,

@@ -16,6 +16,7 @@ FOLDERS = ("shepherd_phys", "envs", "controllers", "scripts")
 ORDER = (
     ("files",),
     ("settings", "cells", "neighbours", "workers", "_frames", "_motion", "_shapes", "_raycast"),
+    ("_engine",),
     ("bodies", "obstacles"),
     ("state",),
     ("geometry", "placement"),
