@@ -200,7 +200,7 @@ class _Run:
         to_policy(learner.model, spec_of(learner.preset, learner.shepherd_steps), self._folder / POLICY)
         for file, kept in self.chosen.items():
             if file == FIRST and (self._folder / file).exists():
-                continue  # the first stays the first, with the budget of its day: so its trials are known by its checksum
+                continue  # with the budget of its day: its trials are known by its checksum
             write_policy(self._folder / file, spec_of(learner.preset, kept.shepherd_steps), kept.weights)
 
     def _tell(self, validation: Sequence[Mapping[str, Any]]) -> None:
