@@ -16,6 +16,8 @@ LEVEL = 0.95
 """Confidence of an interval."""
 BOOTSTRAP_SEED = 20_140_401
 """Resampling is seeded: the same rows give the same interval."""
+DELIVERED, WORST = "in_goal_end", "in_goal_end_worst"
+"""The headline, and the column for its least value: a mean of 99.9 may hide a flock that was forgotten."""
 BLOCK = 2_000_000
 """Numbers drawn at once, so that memory does not grow with the number of trials."""
 
@@ -60,7 +62,7 @@ def intervals(values: NDArray[np.float64], resamples: int = RESAMPLES) -> NDArra
 
 
 def summarise(rows: Iterable[Row], metrics: Sequence[str] = METRICS) -> list[dict[str, Any]]:
-    """One row a point of the experiment: its labels, ``trials``, and ``NAME_mean, NAME_low, NAME_high`` of each metric.
+    """One row a point: labels, ``trials``, ``NAME_mean, NAME_low, NAME_high`` of each metric, and `WORST` of one.
 
     Points are told apart by whichever of `LABELS` the rows have, and come in the order in which they first appear; the
     order of the rows within a point does not matter. Truth counts as 1 and 0.
@@ -68,7 +70,10 @@ def summarise(rows: Iterable[Row], metrics: Sequence[str] = METRICS) -> list[dic
     summary = []
     for labels, trials in _by_point(rows).items():
         values = np.array([[float(row[name]) for row in trials] for name in metrics])
-        summary.append({**dict(labels), "trials": len(trials), **_columns(metrics, intervals(values))})
+        row = {**dict(labels), "trials": len(trials), **_columns(metrics, intervals(values))}
+        if DELIVERED in metrics:
+            row[WORST] = float(values[list(metrics).index(DELIVERED)].min())
+        summary.append(row)
     return summary
 
 
@@ -156,7 +161,8 @@ def _even(means: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def summary_columns(labels: Sequence[str] = LABELS, metrics: Sequence[str] = METRICS) -> tuple[str, ...]:
     """Columns of ``summary.csv``."""
-    return (*labels, "trials", *(f"{name}_{part}" for name in metrics for part in ("mean", "low", "high")))
+    columns = (*labels, "trials", *(f"{name}_{part}" for name in metrics for part in ("mean", "low", "high")))
+    return (*columns, WORST) if DELIVERED in metrics else columns
 
 
 def difference_columns(labels: Sequence[str] = LABELS, metrics: Sequence[str] = METRICS) -> tuple[str, ...]:

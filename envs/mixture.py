@@ -32,6 +32,10 @@ class Mixture(Settings):
     """Least and most neighbours n to whom a sheep is drawn, the paper's cohesion; None: as in the base, whose flock
     model need not have an ``n_neighbours``."""
 
+    uneven: float = Field(default=0.0, ge=0, le=1)
+    """Fraction of the episodes whose flocks differ in size: one sheep each, and the others by shares that are drawn
+    uniformly from all that there are. In the rest they are equal."""
+
     def __post_init__(self) -> None:
         if self.n_flocks[1] > self.base.n_sheep:
             raise ValueError(f"n_flocks may be {self.n_flocks[1]}, more than there are sheep ({self.base.n_sheep})")
@@ -44,4 +48,8 @@ class Mixture(Settings):
         flock = self.base.flock
         if self.n_neighbours is not None:
             flock = flock.but(n_neighbours=int(rng.integers(*self.n_neighbours, endpoint=True)))
-        return self.base.but(n_flocks=n_flocks, flock=flock)
+        sizes = None
+        if self.uneven and rng.random() < self.uneven:
+            others = rng.multinomial(self.base.n_sheep - n_flocks, rng.dirichlet(np.ones(n_flocks)))
+            sizes = tuple(int(1 + more) for more in others)
+        return self.base.but(n_flocks=n_flocks, flock=flock, flock_sizes=sizes)

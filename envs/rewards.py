@@ -23,7 +23,7 @@ import numpy as np
 from pydantic import Field
 
 from shepherd_phys.lidar import CHANNELS, Lidar, Scan
-from shepherd_phys.scenario import Scenario
+from shepherd_phys.scenario import SUCCESS_FRACTION, Scenario
 from shepherd_phys.settings import Settings, SettingsError, settings
 from shepherd_phys.state import Floats, WorldState
 from shepherd_phys.world import SHEEP_SETS, NonFiniteError
@@ -130,6 +130,22 @@ class Effort(Settings):
         """Mean of the shares, 0 where there is no shepherd."""
         shares = self.shares(before, after, scan, scenario)
         return float(shares.mean()) if len(shares) else 0.0
+
+
+@settings
+class Gathered(Settings):
+    """1 / T while the herd is in the goal, all but a few: 1 at most over an episode. In none of the paper's schemes.
+
+    Occupancy pays for the last sheep no more than for any other; this term is the time that is left when the herd is
+    home, by the measure of ``time_to_95``.
+    """
+
+    fraction: float = Field(default=SUCCESS_FRACTION, gt=0, le=1)
+    """Of the sheep that must be in the goal."""
+
+    def __call__(self, before: WorldState, after: WorldState, scan: Scan | None, scenario: Scenario) -> float:
+        """0 or 1 / T."""
+        return float(np.count_nonzero(after.sheep_in_goal) / after.n_sheep >= self.fraction) / scenario.n_steps
 
 
 Scheme = Mapping[str, tuple[float, Term]]

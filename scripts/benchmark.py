@@ -15,21 +15,27 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Annotated, Any
 
 import numpy as np
 import tyro
 
+from shepherd_phys.controllers.base import Controller
+from shepherd_phys.controllers.evaluation import ControllerError, run_episode, trial_seed
 from shepherd_phys.controllers.strombom import StrombomSettings, StrombomTeam
 from shepherd_phys.envs import ShepherdingEnv
 from shepherd_phys.flock import Strombom
 from shepherd_phys.lidar import Lidar, Stack, encode
 from shepherd_phys.scenario import Scenario
+from shepherd_phys.settings import SettingsError
 from shepherd_phys.state import WorldState
 from shepherd_phys.world import World
 
+from .command import fail
 from .impacts import impacts
 from .plain import PlainWorld
+from .points import find_controller
 from .throughput import throughput
 
 LENGTHS = StrombomSettings()
@@ -56,8 +62,10 @@ class Arguments:
     """Instead: compare numbers of substeps and iterations by cost, overlap and impacts."""
     campaign: bool = False
     """Instead: episodes a second of a campaign with one worker and with two."""
+    controller: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
+    """Instead: which part of an episode this controller takes, a policy for example; and episodes a second."""
     seeds: Annotated[int, tyro.conf.arg(metavar="N")] = 4
-    """Episodes of each controller that a run of --campaign counts."""
+    """Episodes (of each controller) that a run of --campaign or --controller counts."""
 
 
 class Stopwatch:
@@ -217,6 +225,22 @@ def scaling(counts: tuple[int, ...] = (100, 1_000, 10_000)) -> dict[str, float]:
     return result
 
 
+def acting(controller: Controller, n_seeds: int) -> dict[str, float]:
+    """One run: episodes of the paper's world as an evaluation runs them, on one core; acting is timed by itself."""
+    env = ShepherdingEnv(Scenario(), rewards={}, lidar=controller.lidar)
+    act = Stopwatch(controller.act)
+    timed = SimpleNamespace(reset=controller.reset, act=act)
+    start = time.perf_counter()
+    for trial in range(n_seeds):
+        run_episode(timed, env, trial_seed(SEED, trial))
+    seconds = time.perf_counter() - start
+    return {
+        "acting_share": act.seconds / seconds,
+        "acting_us": act.seconds / act.calls * 1e6,
+        "episodes_per_second": n_seeds / seconds,
+    }
+
+
 def overlaps(scenario: Scenario, n_steps: int = 1_500) -> dict[str, float]:
     """How deep sheep are in one another and in shepherds while driven, at the end of each control step [m]."""
     world, team, seed = World(scenario), StrombomTeam(LENGTHS), SEED
@@ -292,6 +316,15 @@ def main(argv: list[str]) -> int:
     result: Any
     if args.campaign:
         result = throughput(args.runs, args.seeds)
+    elif args.controller is not None:
+        try:
+            controller = find_controller(args.controller)
+        except (ControllerError, SettingsError) as error:
+            return fail("shepherd-phys benchmark", error, 2)
+        acting(controller, 1)  # compile everything first
+        timed = [acting(controller, args.seeds) for _ in range(args.runs)]
+        result = {key: statistics.median(run[key] for run in timed) for key in timed[0]}
+        result |= {"controller": args.controller, "episodes": args.seeds, "runs": args.runs}
     elif args.engine:
         result = compare_engines(args.runs, args.steps, args.impacts or 5_000)
     elif args.impacts:

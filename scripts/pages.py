@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from shepherd_phys.controllers.claims import EXPERIMENTS
+from shepherd_phys.controllers.summary import WORST
 
 MEASURES = {"in_goal_end": ("Sheep in the goal at the end, %", ".1f"), "path_length": ("Path of a shepherd, m", ".0f")}
 SHOWN = {"n_flocks": "flocks: {}", "cohesion": "n = {}"}
@@ -45,6 +46,30 @@ def figure_page(name: str, summary: Sequence[Mapping[str, Any]]) -> str:
             rows = [cells.get((method, column)) for column in columns]
             shown = ["" if row is None else _interval(row, f"{metric}_mean", f"{metric}_", digits) for row in rows]
             lines.append(line([f"`{method}`", *shown]))
+    return "\n".join([*lines, ""])
+
+
+def beyond_page(summary: Sequence[Mapping[str, Any]]) -> str:
+    """The table of the worlds that the paper does not have.
+
+    Args:
+        summary: rows of ``beyond.csv``.
+    """
+    trials = _range(row["trials"] for row in summary)
+    titles = [title for title, _ in MEASURES.values()]
+    lines = [
+        "# Beyond the paper's worlds",
+        "",
+        "Each differs in one thing from the paper's world with 2 flocks, 3 shepherds, 100 sheep, n = 40; "
+        f"{trials} trials a point; mean [95 % bootstrap interval]; made by `shepherd-phys reproduce beyond`.",
+        "",
+        line(["world", "controller", titles[0], "worst episode, %", titles[1], "95 % in after, s"]),
+        line(["---", "---", *["---:"] * 4]),
+    ]
+    for row in summary:
+        shown = [_interval(row, f"{metric}_mean", f"{metric}_", digits) for metric, (_, digits) in MEASURES.items()]
+        late = _interval(row, "time_to_95_mean", "time_to_95_", ".0f")
+        lines.append(line([row["case"], f"`{row['controller']}`", shown[0], f"{row[WORST]:.0f}", shown[1], late]))
     return "\n".join([*lines, ""])
 
 

@@ -26,6 +26,7 @@ from shepherd_phys.controllers.summary import summarise, summary_columns
 from shepherd_phys.settings import SettingsError
 
 from . import studies
+from .beyond import beyond
 from .command import at_least, cpu_count, fail, flag, parsed, progress_bar, workforce
 from .evaluate import print_table, ready
 from .pages import PART_HEAD, claims_page, few_trials, figure_page, part_cells
@@ -35,10 +36,11 @@ PROG = "shepherd-phys reproduce"
 SCENARIO = "paper"
 EPISODES = (*EXPERIMENTS, "all")
 """Figures made of episodes; all of these."""
-CHOICES = ("figure1", *EPISODES, "ablations")
+CHOICES = ("figure1", *EPISODES, "beyond", "ablations")
 GOES_WITH = {
-    **dict.fromkeys(("literal", "controllers", "scheduler", "gather"), EPISODES),
-    **dict.fromkeys(("trials", "seed", "timeout"), ("figure1", *EPISODES)),
+    **dict.fromkeys(("literal", "scheduler", "gather"), EPISODES),
+    "controllers": (*EPISODES, "beyond"),
+    **dict.fromkeys(("trials", "seed", "timeout"), ("figure1", *EPISODES, "beyond")),
     **dict.fromkeys(("seeds", "budget"), ("figure1", "ablations")),
     "paper_hours": ("figure1",),
 }
@@ -49,8 +51,9 @@ GOES_WITH = {
 class Reproduce:
     """Run the paper's experiments, draw its figures, and judge its claims.
 
-    figure2 and figure3 compare every method that there is, and take some hours; figure1, the learning curves, and
-    ablations, what each ingredient of our recipe buys, train for many hours. all is figure2 and figure3. Writes into
+    figure2 and figure3 compare every method that there is, and take some hours; beyond runs the best of them in worlds
+    that the paper does not have; figure1, the learning curves, and ablations, what each ingredient of our recipe buys,
+    train for many hours. all is figure2 and figure3. Writes into
     the folder --out, for each figure, its CSV, Markdown tables and drawing; claims.json and claims.md; and what lets a
     stopped run continue: give the same command again.
     """
@@ -97,30 +100,33 @@ def main(argv: Sequence[str]) -> int:
         return fail(PROG, error, 2)
     out = sys.stdout
     with contextlib.redirect_stdout(sys.stderr):  # a user's classes may print wherever they are touched
-        return _main(options, out) if options.figure in EPISODES else learn(options, out)
+        return _main(options, out) if options.figure in EPISODES else study(options, out)
 
 
-def learn(options: Reproduce, out: TextIO) -> int:
-    """Run a study of learning; the exit status as of `main`."""
+def study(options: Reproduce, out: TextIO) -> int:
+    """Run what is no figure of episodes; the exit status as of `main`."""
     figure, folder = options.figure, options.out
-    how: dict[str, Any] = {
-        "n_seeds": options.seeds or studies.SEEDS[figure],
-        "budget": options.budget or studies.BUDGETS[figure],
-        "workers": options.workers,
-    }
     try:
-        check_drawing()
-        if figure == "ablations":
-            result = studies.ablations(folder, **how)
+        reported = studies.Reported(SCENARIO, options.trials, options.seed, options.workers, options.timeout)
+        if figure == "beyond":
+            result = beyond(folder, controllers=options.controllers, reported=reported)
         else:
-            reported = studies.Reported(SCENARIO, options.trials, options.seed, options.workers, options.timeout)
-            result = studies.figure1(folder, **how, paper_hours=options.paper_hours, reported=reported)
-    except SettingsError as error:
+            check_drawing()
+            how: dict[str, Any] = {
+                "n_seeds": options.seeds or studies.SEEDS[figure],
+                "budget": options.budget or studies.BUDGETS[figure],
+                "workers": options.workers,
+            }
+            if figure == "ablations":
+                result = studies.ablations(folder, **how)
+            else:
+                result = studies.figure1(folder, **how, paper_hours=options.paper_hours, reported=reported)
+    except (SettingsError, ControllerError) as error:
         return fail(PROG, error, 2)
     except CampaignError as error:
         return fail(PROG, error, 1)
     except KeyboardInterrupt:
-        return fail(PROG, f"stopped; the runs are kept in {folder / studies.TRAINING}: the same command continues", 130)
+        return fail(PROG, f"stopped; what was done is kept in {folder}: the same command continues", 130)
     print(json.dumps(result.tables, allow_nan=False, indent=1) if options.json else result.page, file=out)
     for path in result.paths:
         print(path, file=sys.stderr if options.json else out)

@@ -42,6 +42,7 @@ def place(
     *,
     n_sheep: int,
     n_flocks: int,
+    flock_sizes: tuple[int, ...] | None = None,
     flock_distance: tuple[float, float] = (10.0, 20.0),
     flock_bearing: tuple[float, float] = (0.0, 2.0 * math.pi),
     flock_sd: float = 1.0,
@@ -58,7 +59,8 @@ def place(
     Args:
         rng: source of randomness.
         n_sheep: N.
-        n_flocks: flocks of equal size; where N does not divide, the first ones have one sheep more.
+        n_flocks: flocks, of equal size; where N does not divide, the first ones have one sheep more.
+        flock_sizes: sheep in each of them, where sizes are not equal.
         flock_distance: least and largest distance of a flock's centre from the goal's [m], uniform.
         flock_bearing: least and largest bearing of a flock's centre from the goal [rad], uniform.
         flock_sd: standard deviation of the members about the centre, along each axis [m].
@@ -76,11 +78,13 @@ def place(
     centres = goal + distance[:, None] * np.column_stack([np.cos(bearing), np.sin(bearing)])
     members = flock_sd * rng.standard_normal((n_sheep, 2))
     shepherds = box * (rng.random((n_shepherds, 2)) - 0.5)
-    return goal, centres[flock_of(n_sheep, n_flocks)] + members, shepherds
+    return goal, centres[flock_of(n_sheep, n_flocks, flock_sizes)] + members, shepherds
 
 
-def flock_of(n_sheep: int, n_flocks: int) -> NDArray[np.int64]:
-    """Which flock each sheep (N,) starts in: equal sizes, the first flocks one larger where N does not divide."""
+def flock_of(n_sheep: int, n_flocks: int, flock_sizes: tuple[int, ...] | None = None) -> NDArray[np.int64]:
+    """Which flock each sheep (N,) starts in: the sizes given, or equal ones, the first one larger where N needs it."""
+    if flock_sizes is not None:
+        return np.repeat(np.arange(n_flocks), flock_sizes)
     small, larger = divmod(n_sheep, n_flocks)
     return np.repeat(np.arange(n_flocks), np.where(np.arange(n_flocks) < larger, small + 1, small))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import numbers
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -50,6 +51,11 @@ def _interval(value: Any) -> Any:
     return value
 
 
+def _listed(value: Any) -> Any:
+    """Files know lists only."""
+    return tuple(value) if isinstance(value, list) else value
+
+
 @settings
 class Scenario(Settings):
     """What a world holds, how it is placed at reset, and its two clocks.
@@ -60,7 +66,9 @@ class Scenario(Settings):
     n_sheep: int = Field(default=100, ge=1)
     """N."""
     n_flocks: int = Field(default=2, ge=1)
-    """Flocks of equal size (+-1) at the start."""
+    """Flocks at the start, of equal size (+-1) where ``flock_sizes`` does not say otherwise."""
+    flock_sizes: Annotated[tuple[Annotated[int, Field(ge=1)], ...], BeforeValidator(_listed)] | None = None
+    """Sheep in each flock at the start; none given: equal sizes."""
     flock_distance: Annotated[
         tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]], BeforeValidator(_interval)
     ] = (10.0, 20.0)
@@ -101,6 +109,14 @@ class Scenario(Settings):
     def __post_init__(self) -> None:
         if self.n_flocks > self.n_sheep:
             raise ValueError(f"n_flocks is {self.n_flocks}, more than there are sheep ({self.n_sheep})")
+        if self.flock_sizes is not None and (len(self.flock_sizes), sum(self.flock_sizes)) != (
+            self.n_flocks,
+            self.n_sheep,
+        ):
+            raise ValueError(
+                f"flock_sizes: needs {self.n_flocks} sizes, one a flock, that add up to the {self.n_sheep} sheep "
+                f"(given: {self.flock_sizes})"
+            )
 
     @property
     def n_shepherds(self) -> int:
@@ -169,9 +185,11 @@ class Scenario(Settings):
 SCENARIOS: dict[str, Scenario] = {
     "paper": Scenario(),
     "single": Scenario(n_flocks=1),
+    "double": Scenario(n_sheep=200, goal_radius=2.5 * math.sqrt(2.0)),
     "small": Scenario(n_sheep=20, n_flocks=2, shepherds=2, flock=Strombom(n_neighbours=8), n_steps=500),
 }
-"""Presets by name: the paper's world; one flock; a small one for quick looks."""
+"""Presets by name: the paper's world; one flock; twice the sheep with a goal of twice the area; a small one for quick
+looks."""
 
 
 def load_scenario(name_or_path: str | Path, classes: Iterable[Any] = ()) -> Scenario:

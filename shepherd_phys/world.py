@@ -156,6 +156,7 @@ class World:
                 placement,
                 n_sheep=self._n,
                 n_flocks=scenario.n_flocks,
+                flock_sizes=scenario.flock_sizes,
                 flock_distance=scenario.flock_distance,
                 flock_sd=scenario.flock_sd,
                 n_shepherds=self._p,
@@ -188,7 +189,7 @@ class World:
 
     def _has_room(self, solids: Geometry, goal: Floats, sheep_pos: Floats, shepherd_pos: Floats) -> bool:
         """Whether obstacles leave free the goal (its centre, where it is given), shepherds and flocks' centroids."""
-        flock = flock_of(self._n, self.scenario.n_flocks)
+        flock = flock_of(self._n, self.scenario.n_flocks, self.scenario.flock_sizes)
         centroids = np.array([sheep_pos[flock == k].mean(axis=0) for k in range(self.scenario.n_flocks)])
         points = np.concatenate([goal[None], shepherd_pos, centroids])
         wanted = np.zeros(len(points))

@@ -304,12 +304,12 @@ def test_the_runs_of_figure_1():
         preset = run.preset
         assert run.name == f"{preset.reward}-{preset.seed}" and run.recipe == "fast" and run.hours == float("inf")
         assert set(changes(load_preset("fast").to_dict(), preset.to_dict())) <= {
-            "budget", "reward", "seed", "checkpoint_rollouts", "validation.flocks", "validation.trials",
+            "budget", "reward", "seed", "validation.flocks", "validation.trials",
             "validation.passes",
         }  # fmt: skip
         assert (preset.validation.flocks, preset.validation.trials) == ((1, 2, 3, 4, 5), 20)
         assert (preset.validation.cohesion, preset.validation.shepherds, preset.validation.every) == ((40,), (3,), 1)
-        assert (preset.budget, preset.checkpoint_rollouts, preset.validation.passes) == (1000, 10, 97.0)
+        assert (preset.budget, preset.validation.passes) == (1000, 97.0)
     assert (paper.hours, paper.preset.reward, paper.preset.budget) == (2.0, "wild", 300_000_000)
     assert [run.name for run in figure1(1, 1000, 0.0)] == ["wild-1000000", "any-1000000", "original-1000000"]
 

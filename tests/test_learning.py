@@ -10,6 +10,7 @@ from test_learned import LIDAR, SMALL, random_weights, spec_of
 from shepherd_phys.controllers import Policy, load_policy
 from shepherd_phys.controllers.network import Actor, SectorNetwork, input_shape
 from shepherd_phys.controllers.policy_files import PolicyError
+from shepherd_phys.envs.rewards import SCHEMES
 from shepherd_phys.envs.team import TeamVecEnv
 from shepherd_phys.learning.export import actor_weights, load_actor, to_policy, to_sb3
 from shepherd_phys.learning.export import spec_of as spec_of_preset
@@ -155,6 +156,17 @@ def test_a_rollout_changes_everything_and_measures_whole_episodes(learner):
         assert np.isfinite(one["episode_reward"]) == (one["episodes"] > 0)
 
 
+def test_the_learning_rate_falls_over_the_budget():
+    learner = Learner(TINY.but(ppo=TINY.ppo.but(learning_rate=4e-3, last_learning_rate=1e-3), budget=300))
+    learner.restart(0)
+    for _ in range(4):
+        learner.learn()
+        expected = 4e-3 - 3e-3 * min(learner.shepherd_steps / 300, 1.0)
+        assert learner.policy.optimizer.param_groups[0]["lr"] == pytest.approx(expected)
+    assert expected == 1e-3
+    learner.close()
+
+
 def test_at_first_only_the_critic_learns(tmp_path):
     to_policy(policy_of(LIDAR, SMALL, seed=4), spec_of_preset(TINY), tmp_path / "p.json")
     learner = Learner(TINY.but(init=str(tmp_path / "p.json"), critic_first=1))
@@ -252,11 +264,15 @@ def test_the_papers_preset_is_the_papers():
 
 
 def test_a_preset_may_mix_worlds_and_price_effort():
-    preset = TINY.but(n_flocks=(1, 3), effort=2.0, worlds=5, team_sizes=(3, 1))
+    preset = TINY.but(n_flocks=(1, 3), effort=2.0, gathered=3.0, worlds=5, team_sizes=(3, 1))
     assert preset.sizes == (3, 1, 3, 1, 3) and preset.n_slots == 11
     drawn = preset.draw()(np.random.default_rng(0), 0)
     assert 1 <= drawn.n_flocks <= 3 and drawn.flock == TINY.scenario.flock
-    assert preset.scheme()["effort"][0] == -2.0
+    assert preset.scheme()["effort"][0] == -2.0 and preset.scheme()["gathered"][0] == 3.0
+    assert set(TINY.scheme()) == set(SCHEMES["wild"])
+    far = TINY.but(flock_distance=(4.0, 5.0), uneven=1.0).draw()(np.random.default_rng(0), 0)
+    assert far.flock_distance == (4.0, 5.0) and far.flock_sizes is not None and far.n_flocks == TINY.scenario.n_flocks
+    assert TINY.but(flock_distance=(4.0, 5.0)).draw() == TINY.scenario.but(flock_distance=(4.0, 5.0))
     assert TINY.draw() == TINY.scenario
 
 

@@ -18,9 +18,10 @@ from shepherd_phys.controllers import load_policy
 from shepherd_phys.learning import checkpoints, run
 from shepherd_phys.learning.checkpoints import Checkpoint, CheckpointError
 from shepherd_phys.learning.folder import CURVE_COLUMNS, Table, alone, begin
-from shepherd_phys.learning.preset import load_preset
+from shepherd_phys.learning.preset import Preset, load_preset
 from shepherd_phys.learning.run import train
 from shepherd_phys.learning.validation import Validator
+from shepherd_phys.scripts.train import main as train_main
 from shepherd_phys.settings import SettingsError
 
 # 3 slots x 8 decisions x 5 control steps = 120 a rollout, a few fewer where an episode is cut short; 2 rollouts a
@@ -254,6 +255,13 @@ def test_a_table_goes_on_where_the_checkpoint_was(tmp_path):
 def shepherd_phys(*words, cwd):
     command = Path(sys.executable).parent / "shepherd-phys"
     return subprocess.run([str(command), *words], cwd=cwd, capture_output=True, text=True, timeout=300, check=False)
+
+
+def test_a_run_whose_learning_rate_falls_keeps_its_budget(tmp_path, capsys):
+    begin(tmp_path / "run", PRESET.but(ppo=PRESET.ppo.but(last_learning_rate=1e-5)))
+    assert train_main(["--resume", "--out", str(tmp_path / "run"), "--budget", "700"]) == 2
+    assert "falls over its budget" in capsys.readouterr().err
+    assert Preset.from_toml(tmp_path / "run" / "preset.toml").budget == PRESET.budget
 
 
 @pytest.mark.slow

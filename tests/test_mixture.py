@@ -6,6 +6,7 @@ from team_scenes import SMALL
 
 from shepherd_phys.envs.mixture import Mixture
 from shepherd_phys.settings import SettingsError
+from shepherd_phys.world import World
 
 
 def test_mixture_draws_within_its_ranges_and_from_its_stream():
@@ -21,3 +22,18 @@ def test_mixture_draws_within_its_ranges_and_from_its_stream():
         Mixture(base=SMALL, n_flocks=(1, 9))
     with pytest.raises(SettingsError, match="the smaller number comes first"):
         Mixture(n_flocks=(3, 1))
+
+
+def test_flocks_of_a_mixture_may_differ_in_size():
+    mixture = Mixture(base=SMALL, n_flocks=(1, 4), n_neighbours=None, uneven=0.5)
+    drawn = [mixture(np.random.default_rng(k), 0) for k in range(400)]
+    uneven = [s for s in drawn if s.flock_sizes is not None]
+    assert 150 < len(uneven) < 250
+    for s in uneven:
+        assert len(s.flock_sizes) == s.n_flocks and sum(s.flock_sizes) == SMALL.n_sheep and min(s.flock_sizes) >= 1
+    # two flocks of six sheep: 1 + binomial(4, u) with u uniform gives every size from 1 to 5 alike
+    sizes = [s.flock_sizes[0] for s in uneven if s.n_flocks == 2]
+    assert set(sizes) == {1, 2, 3, 4, 5}
+    world = World(uneven[0])
+    assert world.reset(0).n_sheep == SMALL.n_sheep
+    assert all(s.flock_sizes is None for s in (mixture.but(uneven=0.0)(np.random.default_rng(k), 0) for k in range(20)))

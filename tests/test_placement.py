@@ -18,6 +18,17 @@ def test_flocks_are_even_and_the_larger_come_first():
     assert np.bincount(flock_of(100, 3)).tolist() == [34, 33, 33]
     assert np.bincount(flock_of(101, 3)).tolist() == [34, 34, 33]
     assert np.bincount(flock_of(2, 3)).tolist() == [1, 1]
+    assert np.bincount(flock_of(6, 3, (1, 3, 2))).tolist() == [1, 3, 2]
+
+
+def test_sizes_that_are_given_move_sheep_between_flocks_and_nothing_else():
+    arguments = {"n_sheep": 5, "n_flocks": 2, "n_shepherds": 1, "flock_sd": 1e-9}
+    goal, even, shepherd = place(np.random.default_rng(3), **arguments)
+    same_goal, uneven, same_shepherd = place(np.random.default_rng(3), **arguments, flock_sizes=(1, 4))
+    np.testing.assert_array_equal(goal, same_goal)
+    np.testing.assert_array_equal(shepherd, same_shepherd)
+    np.testing.assert_allclose(even, even[[0, 0, 0, 3, 3]], atol=1e-7)
+    np.testing.assert_allclose(uneven, even[[0, 3, 3, 3, 3]], atol=1e-7)
 
 
 def test_the_same_seed_places_the_same_in_the_documented_order():

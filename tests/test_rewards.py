@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shepherd_phys.envs import ANY, ORIGINAL, SCHEMES, WILD, ShepherdingEnv
-from shepherd_phys.envs.rewards import Distance, Effort, Occlusion, Occupancy
+from shepherd_phys.envs.rewards import Distance, Effort, Gathered, Occlusion, Occupancy
 from shepherd_phys.flock import Strombom
 from shepherd_phys.lidar import Lidar
 from shepherd_phys.scenario import Scenario
@@ -32,6 +32,15 @@ def arranged(scenario, sheep, shepherds, arrived=None):
 def test_occupancy_by_hand():
     _, state = arranged(FOUR, [[0, 0], [2.5, 0], [2.6, 0], [9, 0]], [[20, 0], [-20, 0]])
     assert Occupancy()(state, state, None, FOUR) == 2 / (4 * 10)  # the border belongs to the goal
+
+
+def test_gathered_pays_once_nearly_all_are_in():
+    _, three = arranged(FOUR, [[0, 0], [2.5, 0], [0, 1], [9, 0]], [[20, 0], [-20, 0]])
+    _, all_in = arranged(FOUR, [[0, 0], [2.5, 0], [0, 1], [0, 2]], [[20, 0], [-20, 0]])
+    assert [Gathered()(state, state, None, FOUR) for state in (three, all_in)] == [0.0, 0.1]
+    assert Gathered(fraction=0.75)(three, three, None, FOUR) == 0.1
+    with pytest.raises(SettingsError, match=r"Gathered.fraction: .*less than or equal to 1 .*given: 1.5"):
+        Gathered(fraction=1.5)
 
 
 @pytest.mark.parametrize(("norm", "divisor"), [("NT", 40), ("T", 10), ("none", 1)])

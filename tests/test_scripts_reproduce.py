@@ -19,8 +19,9 @@ from shepherd_phys.controllers import CONTROLLERS
 from shepherd_phys.controllers.claims import EVERYWHERE, EXPERIMENTS, HEURISTICS, LITERAL
 from shepherd_phys.controllers.evaluation import COLUMNS, trial_seed
 from shepherd_phys.controllers.summary import summary_columns
-from shepherd_phys.scripts import main, reproduce
-from shepherd_phys.scripts.pages import claims_page, figure_page
+from shepherd_phys.scenario import load_scenario
+from shepherd_phys.scripts import beyond, main, reproduce
+from shepherd_phys.scripts.pages import beyond_page, claims_page, figure_page
 from shepherd_phys.scripts.reproduce import CHOICES, read_options, roster, work
 
 pytest.importorskip("matplotlib")
@@ -337,3 +338,49 @@ def test_matplotlib_is_loaded_only_to_draw():
     code = "import sys; import shepherd_phys.scripts.reproduce; print('matplotlib' in sys.modules)"
     done = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, timeout=300)
     assert done.stdout == "False\n", done.stderr
+
+
+# ---- beyond the paper -----------------------------------------------------------------------------------------------
+
+
+def test_beyond_runs_each_world_with_each_method(folder, monkeypatch, capsys):
+    (folder / "double.toml").write_text(tomli_w.dumps({**TINY, "n_sheep": 12}))
+    monkeypatch.setattr(beyond, "PAPER", {**beyond.PAPER, "scenario": "tiny.toml"})
+    monkeypatch.setattr(
+        beyond,
+        "CASES",
+        {name: beyond.CASES[name] for name in ("1 shepherd", "n = 3")} | {"more": {"scenario": "double.toml"}},
+    )
+    monkeypatch.setattr(beyond.campaign, "run", partial(campaign.run, retries=0))
+    assert run("beyond", "--controllers", "strombom", "idle", "--json") == 0
+    said = json.loads(capsys.readouterr().out)["beyond"]
+    table = read("o/beyond.csv")
+    assert tuple(table[0]) == ("case", *summary_columns(), "settings_hash")
+    found = [(r["case"], r["controller"], r["n_shepherds"], r["cohesion"], r["n_sheep"], r["trials"]) for r in said]
+    assert found == [
+        (case, method, *numbers, 2)
+        for case, numbers in (("1 shepherd", (1, 40, 6)), ("n = 3", (3, 3, 6)), ("more", (3, 40, 12)))
+        for method in ("strombom", "idle")
+    ]
+    assert [row["in_goal_end_worst"] for row in said] == [float(row["in_goal_end_worst"]) for row in table]
+    page = Path("o/beyond.md").read_text("utf-8")
+    assert page == beyond_page(said)
+    assert "| 1 shepherd | `strombom` |" in page and "2 trials a point" in page
+    first = contents()
+    assert run("beyond", "--controllers", "strombom", "idle") == 0  # nothing is run again
+    assert contents() == first
+
+
+def test_the_worlds_beyond_the_paper():
+    assert beyond.roster(["idle"]) == ["idle"]
+    assert set(beyond.roster([])) <= {"occlusion", "wild", "collie"}
+    double = load_scenario("double")
+    assert double.n_sheep == 200 and double.goal_radius**2 == pytest.approx(2 * load_scenario("paper").goal_radius ** 2)
+
+
+def test_beyond_refuses_the_flags_of_others(folder, capsys):
+    assert run("beyond", "--literal") == 2
+    assert "--literal: goes with figure2, figure3, all, not with beyond" in capsys.readouterr().err
+    assert run("beyond", "--controllers", "nobody") == 2
+    assert "'nobody' is unknown" in capsys.readouterr().err
+    assert not Path("o").exists()

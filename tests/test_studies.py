@@ -118,7 +118,7 @@ def test_figure_1_goes_on_after_a_stop_and_becomes_longer(folder, capsys, monkey
     with monkeypatch.context() as patch:
         patch.setattr("shepherd_phys.scripts.curves._teller", lambda name: stop)
         assert figure1("--paper-hours", "1e-9", budget=240) == 130
-    assert "stopped; the runs are kept in o/training: the same command continues" in capsys.readouterr().err
+    assert "stopped; what was done is kept in o: the same command continues" in capsys.readouterr().err
     assert [path.name for path in Path("o/training").iterdir()] == ["wild-0"]
     assert not Path("o/figure1.csv").exists()
     assert figure1("--paper-hours", "1e-9", budget=240) == 0

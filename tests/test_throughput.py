@@ -1,7 +1,10 @@
-"""``benchmark --campaign``: the figures hang together, whatever they are."""
+"""``benchmark --campaign`` and ``--controller``: the figures hang together, whatever they are."""
 
 import pytest
 
+from shepherd_phys.controllers import Idle
+from shepherd_phys.scenario import Scenario
+from shepherd_phys.scripts import benchmark
 from shepherd_phys.scripts.throughput import CONTROLLERS, one_after_another, throughput
 
 
@@ -38,3 +41,17 @@ def test_the_work_is_the_episodes_of_all_points(tiny):
     from shepherd_phys.scripts.points import points
 
     assert one_after_another(points(controllers=["idle", "random"], scenario=tiny), 3) == {"steps": 12}
+
+
+def test_acting_is_a_part_of_an_episode(monkeypatch):
+    monkeypatch.setattr(benchmark, "Scenario", lambda: Scenario(n_sheep=6, n_flocks=2, shepherds=2, n_steps=6))
+    found = benchmark.acting(Idle(), n_seeds=2)
+    assert 0.0 < found["acting_share"] < 1.0
+    seconds = 2 / found["episodes_per_second"]
+    assert found["acting_us"] * 12 / 1e6 == pytest.approx(found["acting_share"] * seconds)
+
+
+def test_a_controller_that_is_not_there_is_one_line(capsys):
+    assert benchmark.main(["--controller", "nobody"]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("shepherd-phys benchmark: controllers: 'nobody' is unknown") and error.count("\n") == 1

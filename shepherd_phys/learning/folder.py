@@ -61,6 +61,8 @@ def agree(folder: Path, preset: Preset) -> Preset:
     kept = Preset.from_toml(folder / PRESET)
     if kept.but(budget=preset.budget) != preset:
         raise SettingsError(f"{folder}: holds a run with other settings")
+    if kept.budget != preset.budget and kept.ppo.last_learning_rate is not None:
+        raise SettingsError(f"{folder}: its learning rate falls over its budget, {kept.budget}, which stays what it is")
     return kept
 
 

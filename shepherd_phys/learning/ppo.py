@@ -59,6 +59,7 @@ class Learner:
             seed=preset.seed,
             n_workers=n_workers,
         )
+        self._steps_before = 0
         # rewards over the running deviation of discounted returns: the schemes differ in scale
         self.rewards = VecNormalize(self.env, norm_obs=False, gamma=ppo.gamma)
         self._seed_learner(0)
@@ -67,7 +68,7 @@ class Learner:
             self.model = PPO(
                 TeamPolicy,
                 self.rewards,
-                learning_rate=ppo.learning_rate,
+                learning_rate=self._learning_rate,
                 n_steps=ppo.n_steps,
                 batch_size=ppo.batch_size,
                 n_epochs=ppo.n_epochs,
@@ -89,7 +90,6 @@ class Learner:
         self.policy = self.model.policy
         self.rollouts = 0
         """Rollouts learned from since the run began."""
-        self._steps_before = 0
         if start is not None:
             load_actor(self.policy, start.weights)
             with torch.no_grad():  # what it explored at its end is too little to learn anything new
@@ -143,6 +143,14 @@ class Learner:
             **watch.measures(),
             **{name.removeprefix("train/"): float(told[name]) for name in LOGGED if name in told},
         }
+
+    def _learning_rate(self, _: float) -> float:
+        """By shepherd-steps: stable-baselines3's progress counts from its latest `learn`, which is one rollout."""
+        ppo = self.preset.ppo
+        if ppo.last_learning_rate is None:
+            return ppo.learning_rate
+        done = min(self.shepherd_steps / self.preset.budget, 1.0)
+        return ppo.learning_rate + (ppo.last_learning_rate - ppo.learning_rate) * done
 
     def _check_parameters(self) -> None:
         for name, parameter in self.policy.named_parameters():

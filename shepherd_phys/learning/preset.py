@@ -11,7 +11,7 @@ from pydantic import BeforeValidator, Field
 from shepherd_phys.controllers.learned import POLICIES, Policy, load_policy
 from shepherd_phys.controllers.network import SectorNetwork
 from shepherd_phys.envs.mixture import Mixture
-from shepherd_phys.envs.rewards import SCHEMES, Effort, Occlusion, Term
+from shepherd_phys.envs.rewards import SCHEMES, Effort, Gathered, Occlusion, Term
 from shepherd_phys.lidar import Lidar
 from shepherd_phys.scenario import SCENARIOS, Scenario
 from shepherd_phys.settings import Settings, SettingsError, read_toml, settings, write_toml
@@ -26,6 +26,8 @@ def _listed(value: Any) -> Any:
 Count = Annotated[int, Field(ge=1)]
 Counts = Annotated[tuple[Count, ...], Field(min_length=1), BeforeValidator(_listed)]
 Range = Annotated[tuple[Count, Count], BeforeValidator(_listed)]
+Length = Annotated[float, Field(ge=0)]
+Span = Annotated[tuple[Length, Length], BeforeValidator(_listed)]
 
 
 @settings
@@ -52,6 +54,8 @@ class PPOSettings(Settings):
     """Passes over a rollout."""
     learning_rate: float = Field(default=3e-4, gt=0)
     """Of Adam."""
+    last_learning_rate: float | None = Field(default=None, gt=0)
+    """It falls to this one, linearly over the budget; none: it stays."""
     gamma: float = Field(default=0.98, gt=0, lt=1)
     """Discount a decision."""
     gae_lambda: float = Field(default=0.95, ge=0, le=1)
@@ -100,6 +104,8 @@ class Preset(Settings):
     """Name of the reward scheme."""
     effort: float = Field(default=0.0, ge=0)
     """Weight of the cost of walking; 0: none."""
+    gathered: float = Field(default=0.0, ge=0)
+    """Weight of what is paid for while the herd is in the goal, all but a few; 0: nothing."""
     alpha: float | None = Field(default=None, ge=0)
     """Least useful distance of the occlusion term [m]; none: the scheme's."""
     credit: Literal["own", "team"] = "own"
@@ -118,6 +124,10 @@ class Preset(Settings):
     """Least and most flocks, drawn anew for every episode; none: the scenario's."""
     n_neighbours: Range | None = None
     """Least and most neighbours n, drawn anew for every episode; none: the scenario's."""
+    flock_distance: Span | None = None
+    """Least and largest distance of a flock's centre from the goal's while learning [m]; none: the scenario's."""
+    uneven: float = Field(default=0.0, ge=0, le=1)
+    """Fraction of the episodes whose flocks differ in size."""
     init: str | None = None
     """Policy to start from: a shipped one's name, or a .json file."""
     critic_first: int = Field(default=0, ge=0)
@@ -165,13 +175,14 @@ class Preset(Settings):
 
     def draw(self) -> Scenario | Mixture:
         """The scenario, or what draws one for each episode."""
-        if self.n_flocks is None and self.n_neighbours is None:
-            return self.scenario
-        n_flocks = self.n_flocks or (self.scenario.n_flocks, self.scenario.n_flocks)
-        return Mixture(base=self.scenario, n_flocks=n_flocks, n_neighbours=self.n_neighbours)
+        base = self.scenario.but(flock_distance=self.flock_distance) if self.flock_distance else self.scenario
+        if self.n_flocks is None and self.n_neighbours is None and not self.uneven:
+            return base
+        n_flocks = self.n_flocks or (base.n_flocks, base.n_flocks)
+        return Mixture(base=base, n_flocks=n_flocks, n_neighbours=self.n_neighbours, uneven=self.uneven)
 
     def scheme(self) -> dict[str, tuple[float, Term]]:
-        """The reward scheme, with the preset's own alpha and the cost of walking if there is one."""
+        """The reward scheme, with what the preset changes and adds."""
         scheme = dict(SCHEMES[self.reward])
         if self.alpha is not None:
             for name, (weight, term) in scheme.items():
@@ -179,6 +190,8 @@ class Preset(Settings):
                     scheme[name] = (weight, term.but(alpha=self.alpha))
         if self.effort:
             scheme["effort"] = (-self.effort, Effort())
+        if self.gathered:
+            scheme["gathered"] = (self.gathered, Gathered())
         return scheme
 
     def start(self) -> Policy | None:

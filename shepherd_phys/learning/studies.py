@@ -12,8 +12,6 @@ FIRST_SEED = 1_000_000
 HOME = 97.0
 """Sheep delivered with each of 1 to 5 flocks at which a policy counts as bringing them home [%]."""
 FIGURE1 = Validation(flocks=(1, 2, 3, 4, 5), trials=20)
-FIGURE1_CHECKPOINT = 10
-"""Rollouts of `fast` from one validation to the next."""
 PAPER_EVERY = 5
 """Checkpoints of `paper` from one validation to the next: it is slow, and so are its episodes."""
 ABLATIONS = Validation(flocks=(1, 2, 5), trials=20, every=1_000_000)  # none but the last, which every run has
@@ -39,9 +37,7 @@ def figure1(n_seeds: int, budget: int, paper_hours: float) -> list[Run]:
         budget: shepherd-steps of each.
         paper_hours: of the one run of preset `paper`; 0: none.
     """
-    fast = load_preset("fast").but(
-        budget=budget, checkpoint_rollouts=FIGURE1_CHECKPOINT, validation=FIGURE1.but(passes=HOME)
-    )
+    fast = load_preset("fast").but(budget=budget, validation=FIGURE1.but(passes=HOME))
     runs = [
         Run(f"{reward}-{seed}", "fast", fast.but(reward=reward, seed=seed))
         for reward in ("wild", "any", "original")
