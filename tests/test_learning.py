@@ -285,6 +285,7 @@ def test_a_preset_may_mix_worlds_and_price_effort():
         ("team_sizes = []", "team_sizes"),
         ("team_sizes = [0]", "team_sizes"),
         ("critic_first = 3", "critic_first: makes sense only with init"),
+        ("reward = 'original'\nalpha = 1.0", "alpha: the reward 'original' has no occlusion term"),
         ("lidar = 3", "lidar: must be a table"),
         ("scenario = 'moon'", "scenario: must be a table"),
         ("n_flocks = [5, 2]", "smaller number comes first"),

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,11 +15,12 @@ import safetensors.numpy
 from test_learning import TINY
 
 from shepherd_phys.controllers import load_policy
-from shepherd_phys.learning import checkpoints
+from shepherd_phys.learning import checkpoints, run
 from shepherd_phys.learning.checkpoints import Checkpoint, CheckpointError
 from shepherd_phys.learning.folder import CURVE_COLUMNS, Table, alone, begin
 from shepherd_phys.learning.preset import Preset, load_preset
 from shepherd_phys.learning.run import train
+from shepherd_phys.learning.validation import Validator
 from shepherd_phys.scripts.train import main as train_main
 from shepherd_phys.settings import SettingsError
 
@@ -98,6 +100,42 @@ def test_worker_processes_change_nothing(unbroken, tmp_path):
     begin(tmp_path, PRESET)
     train(tmp_path, n_workers=2)
     assert_same_run(tmp_path, unbroken)
+
+
+def test_seconds_and_pace_are_of_training_alone(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(run, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    clock = run._Clock(seconds=7.0, shepherd_steps=1000)  # of earlier processes
+    now[0] += 10.0
+    with clock.stopped():
+        now[0] += 500.0
+    now[0] += 10.0
+    assert (clock.seconds(), clock.rate(1400)) == (27.0, 20.0)
+
+
+def test_a_run_validates_while_its_clock_stands_still(tmp_path, monkeypatch):
+    """The clock is one that only a validation moves on: no time passes for the curve."""
+    now = [0.0]
+    monkeypatch.setattr(run, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    judge = Validator.__call__
+
+    def slow(self, policy):
+        now[0] += 1000.0
+        return judge(self, policy)
+
+    monkeypatch.setattr(Validator, "__call__", slow)
+    begin(tmp_path, PRESET)
+    train(tmp_path)
+    assert now[0] >= 2000.0
+    with open(tmp_path / "curve.csv", newline="", encoding="utf-8") as file:
+        assert {float(row["seconds"]) for row in csv.DictReader(file)} == {0.0}
+
+
+def test_what_passes_is_every_point():
+    rows = [{"in_goal_end": 97.0}, {"in_goal_end": 96.9}]
+    asked = Validator(PRESET.but(validation=PRESET.validation.but(passes=97.0)))
+    assert asked.passes(rows[:1]) and not asked.passes(rows)
+    assert not Validator(PRESET).passes(rows)
 
 
 def test_another_seed_is_another_run(unbroken, tmp_path):

@@ -249,7 +249,7 @@ def test_work_is_three_shepherds_and_a_hundred_sheep():
 
 MISTAKES = [
     ("", "figure"),
-    ("figure9", "figure: 'figure9' is unknown; there are figure1, figure2, figure3, all, ablations"),
+    ("figure9", "figure: 'figure9' is unknown; there are figure1, figure2, figure3, all, beyond, ablations"),
     ("figure2 figure3", "Unrecognized options: figure3"),
     ("figure2 --trials 0", "trials: 0 is impossible; it must be at least 1"),
     ("figure2 --trials many", "; --trials takes a whole number"),
@@ -261,8 +261,8 @@ MISTAKES = [
     ("figure2 --controllers mine:Nobody", "controllers: mine:Nobody: module 'mine' has no 'Nobody'"),
     ("figure2 --flocks 3", "Unrecognized options: --flocks"),
     ("figure1 --literal", "--literal: goes with figure2, figure3, all, not with figure1"),
-    ("figure1 --controllers idle", "--controllers: goes with figure2, figure3, all, not with figure1"),
-    ("ablations --trials 5", "--trials: goes with figure1, figure2, figure3, all, not with ablations"),
+    ("figure1 --controllers idle", "--controllers: goes with figure2, figure3, all, beyond, not with figure1"),
+    ("ablations --trials 5", "--trials: goes with figure1, figure2, figure3, all, beyond, not with ablations"),
     ("ablations --paper-hours 1", "--paper-hours: goes with figure1, not with ablations"),
     ("ablations --paper_hours=1", "--paper-hours: goes with figure1, not with ablations"),
     ("all --budget 9", "--budget: goes with figure1, ablations, not with all"),

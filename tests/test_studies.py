@@ -83,7 +83,7 @@ def test_figure_1_from_nothing_and_again(folder, capsys, monkeypatch):
         assert all(row["episode_reward"] is not None for row in own[:-1])
     checks = read_rows(Path("o/figure1-validation.csv"), VALIDATIONS)
     assert [(row["checkpoint"], row["n_flocks"]) for row in checks if row["reward"] == "wild"] == [
-        (1, 1), (1, 2), (2, 1), (2, 2),
+        (1, 1), (1, 2), (2, 1), (2, 2), (3, 1), (3, 2),
     ]  # fmt: skip
     home = read_rows(Path("o/time-to-home.csv"), HOME_COLUMNS)
     assert [(row["seed"], row["checkpoint"], row["n_flocks"], row["trials"]) for row in home] == [
@@ -123,11 +123,14 @@ def test_figure_1_goes_on_after_a_stop_and_becomes_longer(folder, capsys, monkey
     assert not Path("o/figure1.csv").exists()
     assert figure1("--paper-hours", "1e-9", budget=240) == 0
     short = read_rows(Path("o/figure1.csv"), COLUMNS)
+    first = load_policy("o/training/wild-0/first.json").checksum
     assert {row["recipe"] for row in short} == {"fast", "paper"}
     assert len(read("training/paper-wild-7/curve.csv")) == 1  # its time was over at once
     assert [row["checkpoint"] for row in read("training/paper-wild-7/validation.csv")] == ["1", "1"]
     assert figure1(budget=480) == 0
     assert max(row["shepherd_steps"] for row in read_rows(Path("o/figure1.csv"), COLUMNS)) >= 480
+    assert load_policy("o/training/wild-0/first.json").checksum == first  # the first stays the first
+    assert load_policy("o/training/wild-0/policy.json").checksum != first
     assert figure1("--paper-hours", "1e-9", budget=240) == 0  # and a shorter look at the longer runs
     assert read_rows(Path("o/figure1.csv"), COLUMNS) == short
 
@@ -214,20 +217,8 @@ if __name__ == "__main__":
 """
 
 
-def test_the_ablations_in_a_shell(tmp_path):
-    (tmp_path / "driver.py").write_text(DRIVER)
-    words = ["reproduce", "ablations", "--seeds", "1", "--budget", "480", "--workers", "2", "--out", "o"]
-    done = subprocess.run(
-        [sys.executable, "driver.py", *words],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)},
-        capture_output=True,
-        text=True,
-        timeout=400,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    out = tmp_path / "o"
+def check_ablations(out, said, progress):
+    """What one seed of the two variants of the driver must have left in ``out``."""
     names = ["ablation-base-1000000", "ablation-base-team-credit-1000000"]
     assert sorted(path.name for path in (out / "training").iterdir()) == names
     curves = read_rows(out / "ablations.csv", COLUMNS)
@@ -239,6 +230,47 @@ def test_the_ablations_in_a_shell(tmp_path):
     assert [(row["recipe"], row["n_flocks"]) for row in checks] == [("base", 1), ("base-team-credit", 1)]  # at the end
     page = ablations_page(curves, checks)
     assert (out / "ablations.md").read_text("utf-8") == page
-    assert done.stdout.startswith(page) and done.stdout.splitlines()[-1] == "o/ablations.png"
+    assert said.startswith(page) and said.splitlines()[-1] == "o/ablations.png"
     assert (out / "ablations.png").read_bytes().startswith(b"\x89PNG")
-    assert "ablation-base-1000000: validation at" in done.stderr
+    assert "ablation-base-1000000: validation at" in progress
+    assert not (out / "claims.json").exists()
+
+
+ABLATIONS = ["reproduce", "ablations", "--seeds", "1", "--budget", "300", "--out", "o"]
+
+
+def test_the_ablations_one_after_another(folder, capsys, monkeypatch):
+    kinds = {"base": QUICK, "base-team-credit": QUICK.but(credit="team")}
+    monkeypatch.setattr(studies, "variants", lambda: kinds)
+    monkeypatch.setattr(studies, "ABLATIONS", QUICK.validation.but(every=1_000_000))
+    assert main.main([*ABLATIONS, "--workers", "1"]) == 0
+    said = capsys.readouterr()
+    check_ablations(Path("o"), said.out, said.err)
+
+
+@pytest.mark.slow
+def test_the_ablations_side_by_side_in_a_shell(tmp_path):
+    (tmp_path / "driver.py").write_text(DRIVER)
+    done = subprocess.run(
+        [sys.executable, "driver.py", *ABLATIONS, "--workers", "2"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)},
+        capture_output=True,
+        text=True,
+        timeout=400,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    check_ablations(tmp_path / "o", done.stdout, done.stderr)
+
+
+def test_a_mistake_in_a_shell_is_one_line(tmp_path):
+    words = ["reproduce", "figure1", "--literal"]
+    done = subprocess.run(
+        [Path(sys.executable).with_name("shepherd-phys"), *words],
+        cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stdout) == (2, "")
+    (line,) = done.stderr.splitlines()
+    assert line == "shepherd-phys reproduce: --literal: goes with figure2, figure3, all, not with figure1"
+    assert os.listdir(tmp_path) == []

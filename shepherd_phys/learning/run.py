@@ -199,6 +199,8 @@ class _Run:
         learner = self._learner
         to_policy(learner.model, spec_of(learner.preset, learner.shepherd_steps), self._folder / POLICY)
         for file, kept in self.chosen.items():
+            if file == FIRST and (self._folder / file).exists():
+                continue  # with the budget of its day: its trials are known by its checksum
             write_policy(self._folder / file, spec_of(learner.preset, kept.shepherd_steps), kept.weights)
 
     def _tell(self, validation: Sequence[Mapping[str, Any]]) -> None:
