@@ -81,7 +81,7 @@ class Policy:
         if self._rolls:
             observation, self._offset = observe(observation.reshape(n, *self._frames), self._offset, self._observed)
         if self._action is None or state.step % self._interval == 0:
-            self._action = _wanted(self._actor(observation), self._offset, self._directions)
+            self._action = _wanted(self._actor(observation), self._offset, self._directions, self.spec.action.rest)
         return self._action.copy()
 
     def to_dict(self) -> dict[str, Any]:
@@ -90,16 +90,18 @@ class Policy:
 
 
 @njit(cache=True, error_model="numpy")
-def _wanted(actions, offset, directions):  # type: ignore[no-untyped-def]
+def _wanted(actions, offset, directions, rest):  # type: ignore[no-untyped-def]
     """Actions (P, 2) of a network as the world takes them.
 
-    Clipped to [-1, 1], as while learning, and to the unit disc, as the world does; turned by the angle of beam
-    ``offset`` (P,), as `shepherd_phys.lidar.turn` does.
+    Clipped to [-1, 1], as while learning, and to the unit disc, as the world does; 0 where shorter than ``rest``;
+    turned by the angle of beam ``offset`` (P,), as `shepherd_phys.lidar.turn` does.
     """
     wanted = np.empty(actions.shape)
     for p in range(len(actions)):
         x = min(max(np.float64(actions[p, 0]), -1.0), 1.0)
         y = min(max(np.float64(actions[p, 1]), -1.0), 1.0)
+        if math.hypot(x, y) < rest:
+            x = y = 0.0
         length = max(math.hypot(x, y), 1.0)
         cos, sin = directions[0, offset[p]] / length, directions[1, offset[p]] / length
         wanted[p, 0] = cos * x - sin * y

@@ -51,6 +51,9 @@ class Acting(Settings):
     """Axes of its output: the world's, or those of the goal frame, from which it is turned back. The lidar's frame."""
     interval: int = Field(default=1, ge=1, le=1000)
     """Control steps for which a decision is held."""
+    rest: float = Field(default=0.0, ge=0, lt=1)
+    """Wanted speeds below this part of the top speed mean standing still: an output that is never quite 0 creeps tens
+    of metres in an episode."""
 
 
 @dataclass(frozen=True)

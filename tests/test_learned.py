@@ -158,6 +158,20 @@ def test_a_decision_is_held_for_its_interval():
     assert same == [True, True, False, True, True]
 
 
+def test_less_than_the_least_speed_is_standing_still():
+    lidar = Lidar(beams=16, stack=1)
+    weights = random_weights(SMALL, lidar, 3)
+    weights["action.weight"] *= 0.01
+    weights["action.bias"] *= 0.01
+    observation = np.random.default_rng(1).random((40, 3, 16), dtype=np.float32)
+    walks = Policy(spec_of(lidar), weights).act(observation, STATE)
+    speed = np.hypot(*walks.T)
+    rest = float(np.median(speed))
+    rests = Policy(spec_of(lidar, rest=rest), weights).act(observation, STATE)
+    np.testing.assert_array_equal(rests, np.where((speed < rest)[:, None], 0.0, walks))
+    assert 0 < np.count_nonzero(rests[:, 0] == 0.0) < 40
+
+
 def test_each_shepherd_acts_alone():
     """Whoever else is in the team: the same observation, the same action."""
     policy = Policy(spec_of(), random_weights(SMALL, LIDAR))
@@ -349,6 +363,7 @@ HOSTILE_FIELDS = {
     "another frame": {"action": {"frame": "world"}},
     "a frame that is none": {"action": {"frame": "moon"}},
     "an interval of nothing": {"action": {"frame": "goal", "interval": 0}},
+    "never moving": {"action": {"frame": "goal", "rest": 1.0}},
     "rewards that are a list": {"rewards": []},
     "training that is text": {"training": "yes"},
 }

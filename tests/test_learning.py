@@ -270,6 +270,8 @@ def test_a_preset_may_mix_worlds_and_price_effort():
     assert 1 <= drawn.n_flocks <= 3 and drawn.flock == TINY.scenario.flock
     assert preset.scheme()["effort"][0] == -2.0 and preset.scheme()["gathered"][0] == 3.0
     assert set(TINY.scheme()) == set(SCHEMES["wild"])
+    spec = spec_of_preset(TINY.but(rest=0.25))
+    assert (spec.action.rest, spec_of_preset(TINY).action.rest) == (0.25, 0.0) and "rest" not in spec.training
     far = TINY.but(flock_distance=(4.0, 5.0), uneven=1.0).draw()(np.random.default_rng(0), 0)
     assert far.flock_distance == (4.0, 5.0) and far.flock_sizes is not None and far.n_flocks == TINY.scenario.n_flocks
     assert TINY.but(flock_distance=(4.0, 5.0)).draw() == TINY.scenario.but(flock_distance=(4.0, 5.0))

@@ -106,6 +106,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_nothing_is_left_behind_and_nobody_complains(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)
@@ -114,6 +115,7 @@ def test_nothing_is_left_behind_and_nobody_complains(tmp_path):
     assert (done.returncode, done.stdout, done.stderr) == (0, "end\n", "")
 
 
+@pytest.mark.slow
 def test_a_script_without_its_main_guard_is_told_so(tmp_path):
     script = tmp_path / "script.py"
     script.write_text("from shepherd_phys.envs.team import TeamVecEnv\nTeamVecEnv('small', (1,), n_workers=1)\n")

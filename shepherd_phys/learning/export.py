@@ -23,7 +23,7 @@ from shepherd_phys.settings import tagged
 def spec_of(preset: Preset, shepherd_steps: int = 0) -> PolicySpec:
     """What the file of a policy trained by ``preset`` says beside its weights."""
     training = preset.to_dict()
-    for name in ("scenario", "lidar", "network", "reward", "effort", "alpha", "credit"):
+    for name in ("scenario", "lidar", "network", "reward", "effort", "alpha", "credit", "rest"):
         training.pop(name, None)
     rewards = {
         "scheme": preset.reward,
@@ -34,7 +34,7 @@ def spec_of(preset: Preset, shepherd_steps: int = 0) -> PolicySpec:
         scenario=preset.scenario,
         lidar=preset.lidar,
         network=preset.network,
-        action=Acting(frame=preset.lidar.frame),
+        action=Acting(frame=preset.lidar.frame, rest=preset.rest),
         rewards=rewards,
         training={**training, "algorithm": "PPO of stable-baselines3", "shepherd_steps": shepherd_steps},
     )

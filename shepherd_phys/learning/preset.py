@@ -108,6 +108,9 @@ class Preset(Settings):
     """Weight of what is paid for while the herd is in the goal, all but a few; 0: nothing."""
     alpha: float | None = Field(default=None, ge=0)
     """Least useful distance of the occlusion term [m]; none: the scheme's."""
+    rest: float = Field(default=0.0, ge=0, lt=1)
+    """Of the policy when it is deployed, and validated: wanted speeds below this part of the top speed mean standing
+    still. Learning does not know of it."""
     credit: Literal["own", "team"] = "own"
     """Who is paid for a term that has shares: each shepherd by its own, or all by the mean."""
     decision_interval: int = Field(default=5, ge=1)
