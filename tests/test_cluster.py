@@ -84,6 +84,7 @@ def whole(tmp_path, todo):
     return (tmp_path / "whole" / "episodes.csv").read_bytes()
 
 
+@pytest.mark.slow
 def test_a_killed_worker_loses_nothing(tmp_path, dask):
     todo = jobs.tasks(80)
     workers = [dask.worker() for _ in range(2)]
@@ -99,6 +100,7 @@ def test_a_killed_worker_loses_nothing(tmp_path, dask):
     assert (tmp_path / "cluster" / "episodes.csv").read_bytes() == whole(tmp_path, todo)
 
 
+@pytest.mark.slow
 def test_episodes_that_die_or_throw_are_lost_alone(tmp_path, dask):
     todo = [task for task in jobs.tasks(50) if task.seed < 8 or task.seed == 43]
     for _ in range(2):
@@ -111,7 +113,8 @@ def test_episodes_that_die_or_throw_are_lost_alone(tmp_path, dask):
     assert [seed for _, seed, _ in ledger_rows(tmp_path / "cluster")] == [0, 1, 2, 4, 5, 6, 7]
 
 
-@pytest.mark.parametrize("nanny", [True, pytest.param(False, marks=pytest.mark.slow)], ids=["nanny", "none"])
+@pytest.mark.slow
+@pytest.mark.parametrize("nanny", [True, False], ids=["nanny", "none"])
 def test_an_episode_that_hangs_is_lost_alone(tmp_path, dask, nanny):
     todo = [task for task in jobs.tasks(40) if task.seed > 28]
     dask.worker(threads=2, nanny=nanny)

@@ -191,6 +191,7 @@ def test_the_command_in_a_shell(folder):
     assert mistakes(done.stderr) == []
 
 
+@pytest.mark.slow
 def test_json_is_all_that_there_is_on_standard_output(folder):
     done = shell("evaluate --scenario tiny.toml --controllers mine:Chase idle --trials 2 --workers 1 --json --out o")
     assert done.returncode == 0, done.stderr

@@ -76,6 +76,7 @@ def said_wrong(err):
 # ---- what it writes -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_papers_world_in_a_shell(tmp_path):
     done = subprocess.run(
         [COMMAND, *["reproduce", "figure2", "--controllers", "idle", "--trials", "1", "--workers", "1", "--json"]],
@@ -180,6 +181,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_a_killed_run_continues_and_ends_the_same(folder):
     Path("driver.py").write_text(DRIVER)
     words = ["reproduce", "figure2", "--controllers", "idle", "random", "--trials", "60", "--out", "o", "--workers"]

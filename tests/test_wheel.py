@@ -67,6 +67,7 @@ def test_it_holds_one_package_and_all_of_it(wheel: Path) -> None:
     assert sources == {name for name in names if ".dist-info/" not in name}
 
 
+@pytest.mark.slow
 def test_it_works_with_its_core_dependencies_alone(wheel: Path, tmp_path: Path) -> None:
     run(sys.executable, "-m", "venv", "empty", cwd=tmp_path)
     python = tmp_path / "empty" / "bin" / "python"
