@@ -32,12 +32,13 @@ from shepherd_phys.settings import SettingsError
 from shepherd_phys.state import WorldState
 from shepherd_phys.world import World
 
-from .command import fail
+from .command import at_least, fail, parsed
 from .impacts import impacts
 from .plain import PlainWorld
 from .points import find_controller
 from .throughput import throughput
 
+PROG = "shepherd-phys benchmark"
 LENGTHS = StrombomSettings()
 """Of the team that drives: not the tuned ones, so that the load stays the same when those change."""
 SEED = 0
@@ -318,14 +319,11 @@ def machine() -> str:
 
 def main(argv: list[str]) -> int:
     """Run the command."""
-    args = tyro.cli(Arguments, prog="shepherd-phys benchmark", args=argv)
-    for name in ("runs", "steps", "seeds"):
-        if getattr(args, name) < 1:
-            print(f"--{name}: must be at least 1 (given: {getattr(args, name)})", file=sys.stderr)
-            return 2
-    if args.impacts < 0:
-        print(f"--impacts: must not be negative (given: {args.impacts})", file=sys.stderr)
-        return 2
+    try:
+        args, _ = parsed(Arguments, PROG, argv)
+        at_least(vars(args), {"runs": 1, "steps": 1, "seeds": 1, "impacts": 0})
+    except SettingsError as error:
+        return fail(PROG, error, 2)
     result: Any
     if args.campaign:
         result = throughput(args.runs, args.seeds)
@@ -333,7 +331,7 @@ def main(argv: list[str]) -> int:
         try:
             controller = find_controller(args.controller)
         except (ControllerError, SettingsError) as error:
-            return fail("shepherd-phys benchmark", error, 2)
+            return fail(PROG, error, 2)
         acting(controller, 1)  # compile everything first
         timed = [acting(controller, args.seeds) for _ in range(args.runs)]
         result = {key: statistics.median(run[key] for run in timed) for key in timed[0]}

@@ -58,7 +58,7 @@ class Reproduce:
     stopped run continue: give the same command again.
     """
 
-    figure: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="|".join(CHOICES))]
+    figure: Annotated[tyro.conf.Positional[str], flag("|".join(CHOICES), "")] = ""
     """What to reproduce; all is figure2 and figure3, which share a point that is run once."""
     literal: tyro.conf.FlagCreatePairsOff[bool] = False
     """Add the heuristics as published: strombom-literal, pierson-reconstructed, elfiqi-literal."""
@@ -296,7 +296,8 @@ def read_options(argv: Sequence[str]) -> Reproduce:
     """
     options, given = parsed(Reproduce, PROG, argv)
     if options.figure not in CHOICES:
-        raise SettingsError(f"figure: {options.figure!r} is unknown; there are {', '.join(CHOICES)}")
+        given_one = f"{options.figure!r} is unknown" if options.figure else "none was given"
+        raise SettingsError(f"figure: {given_one}; there are {', '.join(CHOICES)}")
     for name in ("controllers", "gather"):
         if name in given and not getattr(options, name):
             raise SettingsError(f"--{name}: needs at least one value")

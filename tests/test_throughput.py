@@ -51,7 +51,16 @@ def test_acting_is_a_part_of_an_episode(monkeypatch):
     assert found["acting_us"] * 12 / 1e6 == pytest.approx(found["acting_share"] * seconds)
 
 
-def test_a_controller_that_is_not_there_is_one_line(capsys):
-    assert benchmark.main(["--controller", "nobody"]) == 2
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--controller", "nobody"], "controllers: 'nobody' is unknown"),
+        (["--runs", "0"], "runs: 0 is impossible; it must be at least 1"),
+        (["--impacts", "-1"], "impacts: -1 is impossible; it must be at least 0"),
+        (["--steps", "many"], "--steps"),
+    ],
+)
+def test_a_mistake_is_one_line(words, said, capsys):
+    assert benchmark.main(words) == 2
     error = capsys.readouterr().err
-    assert error.startswith("shepherd-phys benchmark: controllers: 'nobody' is unknown") and error.count("\n") == 1
+    assert error.startswith("shepherd-phys benchmark: ") and said in error and error.count("\n") == 1
