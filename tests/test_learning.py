@@ -167,6 +167,24 @@ def test_the_learning_rate_falls_over_the_budget():
     learner.close()
 
 
+def test_exploration_is_limited_by_a_line():
+    learner = Learner(TINY.but(ppo=TINY.ppo.but(log_std_init=-0.5, last_log_std=-2.5, last_log_std_at=200)))
+    learner.restart(0)
+    for limit in (-0.5, -0.5 - 2.0 * 120 / 200, -2.5, -2.5):
+        steps = learner.shepherd_steps
+        assert limit == pytest.approx(
+            max(-2.5, -0.5 - 2.0 * steps / 200), abs=0.3
+        )  # a few steps fewer at episodes' ends
+        with torch.no_grad():
+            learner.policy.log_std[0] = 0.9  # as if it had been learned
+            learner.policy.log_std[1] = -3.0
+        learner._limit_exploration()
+        first, second = learner.policy.log_std.tolist()
+        assert first == pytest.approx(-0.5 - 2.0 * min(steps / 200, 1.0)) and second == -3.0  # less is left alone
+        learner.learn()
+    learner.close()
+
+
 def test_at_first_only_the_critic_learns(tmp_path):
     to_policy(policy_of(LIDAR, SMALL, seed=4), spec_of_preset(TINY), tmp_path / "p.json")
     learner = Learner(TINY.but(init=str(tmp_path / "p.json"), critic_first=1))

@@ -126,6 +126,7 @@ class Learner:
         only_critic = self.rollouts < self.preset.critic_first
         for parameter in _actor(self.policy).values():
             parameter.requires_grad_(not only_critic)
+        self._limit_exploration()
         watch = _Watch()
         n = self.env.num_envs * model.n_steps
         try:
@@ -151,6 +152,14 @@ class Learner:
             return ppo.learning_rate
         done = min(self.shepherd_steps / self.preset.budget, 1.0)
         return ppo.learning_rate + (ppo.last_learning_rate - ppo.learning_rate) * done
+
+    def _limit_exploration(self) -> None:
+        """Cut log_std to the preset's line, before each rollout."""
+        ppo = self.preset.ppo
+        if ppo.last_log_std is not None:
+            done = min(self.shepherd_steps / ppo.last_log_std_at, 1.0)
+            with torch.no_grad():
+                self.policy.log_std.clamp_(max=ppo.log_std_init + (ppo.last_log_std - ppo.log_std_init) * done)
 
     def _check_parameters(self) -> None:
         for name, parameter in self.policy.named_parameters():

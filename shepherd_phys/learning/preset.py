@@ -70,6 +70,12 @@ class PPOSettings(Settings):
     """Longer gradients are cut to this length."""
     log_std_init: float = Field(default=-0.3, ge=-5, le=1)
     """Logarithm of the exploration's standard deviation at the start."""
+    last_log_std: float | None = Field(default=None, ge=-5, le=1)
+    """That logarithm may be no more than a line from ``log_std_init`` to this one, whatever is learned: a policy acts
+    without exploration when it is deployed, and must learn to get out of where only exploration got it out. None: no
+    such line."""
+    last_log_std_at: int = Field(default=4_000_000, ge=1)
+    """Shepherd-steps at which the line reaches ``last_log_std``, where it stays."""
 
 
 @settings
