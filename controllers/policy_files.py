@@ -35,6 +35,8 @@ MAX_JSON = 1 << 20
 """Largest description that is read [bytes]."""
 MAX_WEIGHTS = 1 << 26
 """Largest weights that are read [bytes]."""
+MAX_FRAMES = 1 << 22
+"""Most numbers in the remembered frames of a shepherd: 2,048 frames of 4 channels and 512 beams."""
 HEADER = 1 << 16
 """What a safetensors file may hold beside its numbers [bytes]."""
 
@@ -151,6 +153,10 @@ def read_policy(
     size = 4 * sum(math.prod(shape) for shape in shapes.values())
     if size > MAX_WEIGHTS:
         raise PolicyError(f"{path}: network: {size} bytes of weights; at most {MAX_WEIGHTS} are read")
+    lidar = spec.lidar
+    kept = ((lidar.stack - 1) * lidar.stack_stride + 1) * len(lidar.channels) * lidar.beams
+    if kept > MAX_FRAMES:
+        raise PolicyError(f"{path}: lidar: {kept} numbers of frames to remember a shepherd; at most {MAX_FRAMES}")
     beside = path.with_suffix(".safetensors")
     blob = _read(beside, size + HEADER)
     if hashlib.sha256(blob).hexdigest() != table["weights_sha256"]:
@@ -205,7 +211,11 @@ def _parsed(blob: bytes, path: Path) -> dict[str, Any]:
         what = f"unknown field {_brief(repr(unknown[0]))}" if unknown else f"no field {missing[0]!r}"
         raise PolicyError(f"{path}: {what}; a policy has {', '.join(FIELDS)}")
     given = table["checksum"]
-    if given != _checksum({name: value for name, value in table.items() if name != "checksum"}):
+    try:
+        checksum = _checksum({name: value for name, value in table.items() if name != "checksum"})
+    except RecursionError:  # what can be read need not be shallow enough to be written
+        raise PolicyError(f"{path}: is nested too deeply") from None
+    if given != checksum:
         raise PolicyError(f"{path}: was changed after it was written (its checksum is wrong)")
     return table
 

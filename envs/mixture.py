@@ -39,6 +39,8 @@ class Mixture(Settings):
     def __post_init__(self) -> None:
         if self.n_flocks[1] > self.base.n_sheep:
             raise ValueError(f"n_flocks may be {self.n_flocks[1]}, more than there are sheep ({self.base.n_sheep})")
+        if self.base.flock_sizes is not None:
+            raise ValueError(f"base.flock_sizes: a mixture draws its own (given: {self.base.flock_sizes})")
         if self.n_neighbours is not None and not hasattr(self.base.flock, "n_neighbours"):
             raise ValueError(f"n_neighbours: {type(self.base.flock).__name__} has none; give None")
 

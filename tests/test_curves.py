@@ -261,6 +261,7 @@ def test_variants_differ_in_what_they_say():
     assert plain["fast"] == load_preset("fast").to_dict()
     less = {name: changes(plain["fast"], other) for name, other in plain.items() if name.startswith("fast-")}
     gamma = less["fast-every-step"].pop("ppo.gamma")
+    assert less["fast-every-step"].pop("ppo.gae_lambda") ** 5 == pytest.approx(0.95)
     assert less == {
         "fast-world-frame": {"lidar.frame": "world"},
         "fast-team-credit": {"credit": "team"},

@@ -349,6 +349,7 @@ HOSTILE_FIELDS = {
     "terminal escapes": {"scenario": {"sheep": {"kind": "\x1b[2J\x07" * 50}}},
     "lidar missing": {"lidar": None},
     "an unknown field of the lidar": {"lidar": {**LIDAR.to_dict(), "path": "/"}},
+    "frames without end": {"lidar": {**LIDAR.to_dict(), "stack_stride": 1_000_000}},
     "another layout": {"lidar": {**LIDAR.to_dict(), "layout": "paper"}},
     "a lidar of another size": {"lidar": {**LIDAR.to_dict(), "sectors": 32}},
     "a stack of a million": {"lidar": {**LIDAR.to_dict(), "stack": 1_000_000}},
@@ -398,6 +399,15 @@ BAD_TEXTS = {
     "a field twice": b'{"format": 1, "format": 2}',
     "too large": b'"' + b"x" * MAX_JSON + b'"',
 }
+
+
+def test_nesting_of_any_depth_is_one_error(policy_path):
+    """There are depths at which a table can be read and not be written."""
+    text = policy_path.read_text()
+    assert '"seed": 1' in text
+    for depth in (*range(100, 1000, 50), 100_000):
+        policy_path.write_text(text.replace('"seed": 1', f'"seed": {"[" * depth}{"]" * depth}'))
+        refused(policy_path)
 
 
 @pytest.mark.parametrize("name", BAD_TEXTS)

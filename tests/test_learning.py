@@ -316,6 +316,9 @@ def test_a_preset_may_mix_worlds_and_price_effort():
         ("[ppo]\ngamma = 1.5", "gamma"),
         ("[validation]\nseed = 20000", "seed"),
         ("[scenario]\nn_sheep = 0", "n_sheep"),
+        ("[scenario]\nshepherds = 0", "scenario.shepherds: there must be one"),
+        ("[scenario]\nflock_sizes = [60, 40]", "scenario.flock_sizes: validation has other numbers"),
+        ("[scenario]\nn_sheep = 4", "validation.flocks: 5 flocks of 4 sheep cannot be"),
         ("budget =", "is not a TOML file"),
     ],
 )

@@ -20,6 +20,8 @@ def test_mixture_draws_within_its_ranges_and_from_its_stream():
     assert kept.flock == SMALL.flock
     with pytest.raises(SettingsError, match="n_flocks may be 9, more than there are sheep"):
         Mixture(base=SMALL, n_flocks=(1, 9))
+    with pytest.raises(SettingsError, match="base.flock_sizes: a mixture draws its own"):
+        Mixture(base=SMALL.but(flock_sizes=(1, 5)), n_flocks=(1, 2))
     with pytest.raises(SettingsError, match="the smaller number comes first"):
         Mixture(n_flocks=(3, 1))
 

@@ -25,6 +25,8 @@ def spec_of(preset: Preset, shepherd_steps: int = 0) -> PolicySpec:
     training = preset.to_dict()
     for name in ("scenario", "lidar", "network", "reward", "effort", "alpha", "credit", "rest"):
         training.pop(name, None)
+    if preset.init is not None:
+        training["init"] = Path(preset.init).name  # where it lay is nobody's business
     rewards = {
         "scheme": preset.reward,
         "credit": preset.credit,

@@ -233,8 +233,7 @@ class _Watch(BaseCallback):
 
     def __init__(self) -> None:
         super().__init__()
-        self._ended: list[dict[str, Any]] = []
-        self._episodes = 0
+        self._ended: list[dict[str, float]] = []
 
     def _on_step(self) -> bool:
         seen = self.locals
@@ -244,15 +243,18 @@ class _Watch(BaseCallback):
             finite = torch.isfinite(array).all() if isinstance(array, torch.Tensor) else np.isfinite(array).all()
             if not finite:
                 raise TrainingError(f"{name}: holds a NaN or an infinity: training stops")
-        ended = [info for info in seen["infos"] if "episode" in info]
-        self._ended += ended
-        self._episodes += len({info["world"] for info in ended})
+        worlds: dict[int, list[dict[str, Any]]] = {}
+        for info in seen["infos"]:
+            if "episode" in info:
+                worlds.setdefault(info["world"], []).append(info)
+        for team in worlds.values():  # an episode counts once, however many shepherds it has
+            self._ended.append({key: float(np.mean([info[key] for info in team])) for key in EPISODE.values()})
         return True
 
     def measures(self) -> dict[str, float]:
-        """Whole episodes that ended, and means over their shepherds."""
-        found: dict[str, float] = {"episodes": self._episodes}
+        """How many whole episodes ended, and means over them."""
+        found: dict[str, float] = {"episodes": len(self._ended)}
         for name, key in EPISODE.items():
-            values = [float(info[key]) for info in self._ended]
+            values = [episode[key] for episode in self._ended]
             found[name] = float(np.mean(values)) if values else float("nan")
         return found

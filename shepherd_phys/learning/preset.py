@@ -159,6 +159,14 @@ class Preset(Settings):
             raise ValueError(f"reward: {self.reward!r} is not one of {', '.join(SCHEMES)}")
         if self.alpha is not None and not any(isinstance(t, Occlusion) for _, t in SCHEMES[self.reward].values()):
             raise ValueError(f"alpha: the reward {self.reward!r} has no occlusion term (given: {self.alpha})")
+        if not self.scenario.shepherds:
+            raise ValueError("scenario.shepherds: there must be one, whose body the teams have")
+        if self.scenario.flock_sizes is not None:
+            raise ValueError("scenario.flock_sizes: validation has other numbers of flocks; uneven draws sizes")
+        if max(self.validation.flocks) > self.scenario.n_sheep:
+            raise ValueError(
+                f"validation.flocks: {max(self.validation.flocks)} flocks of {self.scenario.n_sheep} sheep cannot be"
+            )
         try:
             self.network.shapes(self.lidar)
             self.draw()

@@ -93,10 +93,14 @@ def variants() -> dict[str, Preset]:
 
 
 def deciding_every(preset: Preset, interval: int) -> Preset:
-    """A preset that decides every so many control steps, with the same discount a second and as long a rollout.
+    """A preset that decides every so many control steps: the same discount and lambda a second, as long a rollout.
 
-    The rollout's length is rounded to whole decisions; the batch holds as many decisions as before.
+    The rollout's length is rounded to whole decisions; the batch holds as many decisions as before, so that there are
+    more minibatches, or fewer.
     """
     longer = interval / preset.decision_interval
-    ppo = preset.ppo.but(gamma=preset.ppo.gamma**longer, n_steps=max(1, round(preset.ppo.n_steps / longer)))
+    own = preset.ppo
+    ppo = own.but(
+        gamma=own.gamma**longer, gae_lambda=own.gae_lambda**longer, n_steps=max(1, round(own.n_steps / longer))
+    )
     return preset.but(decision_interval=interval, ppo=ppo)
