@@ -6,16 +6,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from shepherd_phys import campaign
 from shepherd_phys.campaign import write_bytes, write_csv
 from shepherd_phys.controllers import CONTROLLERS
-from shepherd_phys.controllers.evaluation import trial_seed
 from shepherd_phys.controllers.summary import summarise, summary_columns
 
-from .command import progress_bar
-from .evaluate import ready
 from .pages import beyond_page
-from .points import episode, points, table, tasks
+from .points import points, table, tasks
 from .studies import Reported, Result
 
 PAPER: Mapping[str, Any] = {"scenario": "paper", "flocks": (2,), "cohesion": (40,), "shepherds": (3,)}
@@ -48,13 +44,10 @@ def beyond(folder: Path, *, controllers: Sequence[str], reported: Reported) -> R
         CampaignError: the ledger is not to be had, no worker can be started, or a file cannot be written.
     """
     methods = roster(controllers)
-    seeds = [trial_seed(reported.seed, trial) for trial in range(reported.trials)]
+    seeds = reported.seeds()
     cases = {title: tasks(points(controllers=methods, **{**PAPER, **case}), seeds) for title, case in CASES.items()}
     todo = [task for own in cases.values() for task in own]
-    with progress_bar() as report, ready(folder, todo) as ledger:
-        outcome = campaign.run(
-            todo, episode, workers=reported.workers, ledger=ledger, timeout=reported.timeout, report=report
-        )
+    outcome, failures = reported.run(folder, todo)
     rows = table(todo, outcome)
     summary: list[dict[str, Any]] = []
     for title, own in cases.items():
@@ -66,5 +59,4 @@ def beyond(folder: Path, *, controllers: Sequence[str], reported: Reported) -> R
     paths = [folder / "beyond.csv", folder / "beyond.md"]
     write_csv(paths[0], ("case", *summary_columns(), "settings_hash"), summary)
     write_bytes(paths[1], page.encode())
-    failures = [f"no result in {failure.attempts} attempts: {failure}" for failure in outcome.failures]
     return Result({"beyond": summary}, page, paths, failures)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from shepherd_phys import __version__, campaign
-from shepherd_phys.campaign import write_bytes, write_csv
+from shepherd_phys.campaign import Outcome, Task, write_bytes, write_csv
 from shepherd_phys.controllers.claims import judge
 from shepherd_phys.controllers.curves import COLUMNS
 from shepherd_phys.controllers.evaluation import trial_seed
@@ -60,6 +60,23 @@ class Reported(NamedTuple):
     seed: int
     workers: int
     timeout: float
+
+    def seeds(self) -> list[int]:
+        """Of the trials."""
+        return [trial_seed(self.seed, trial) for trial in range(self.trials)]
+
+    def run(self, folder: Path, todo: Sequence[Task]) -> tuple[Outcome, list[str]]:
+        """Run what the folder's ledger lacks of the tasks: what came of all, and which have no result, and why.
+
+        Raises:
+            SettingsError: no world can be placed for a point.
+            CampaignError: the ledger is not to be had, or no worker can be started.
+        """
+        with progress_bar() as report, ready(folder, todo) as ledger:
+            outcome = campaign.run(
+                todo, episode, workers=self.workers, ledger=ledger, timeout=self.timeout, report=report
+            )
+        return outcome, [f"no result in {failure.attempts} attempts: {failure}" for failure in outcome.failures]
 
 
 def figure1(folder: Path, *, n_seeds: int, budget: int, paper_hours: float, workers: int, reported: Reported) -> Result:
@@ -196,12 +213,9 @@ def confirm(home: Sequence[Row], runs: Sequence[Run], folder: Path, reported: Re
     )
     todo = tasks(
         [point for point in grid if (point.controller, point.scenario.n_flocks) in wanted],
-        [trial_seed(reported.seed, trial) for trial in range(reported.trials)],
+        reported.seeds(),
     )
-    with progress_bar() as report, ready(folder, todo) as ledger:
-        outcome = campaign.run(
-            todo, episode, workers=reported.workers, ledger=ledger, timeout=reported.timeout, report=report
-        )
+    outcome, failures = reported.run(folder, todo)
     delivered: dict[tuple[str, int], list[float]] = {}
     for task, row in zip(todo, outcome.rows, strict=True):
         if row is not None:
@@ -212,7 +226,7 @@ def confirm(home: Sequence[Row], runs: Sequence[Run], folder: Path, reported: Re
         if len(values) == reported.trials:
             mean, low, high = (float(number) for number in intervals(np.array([values]))[0])
             wanted[key] |= {"confirmed_mean": mean, "confirmed_low": low, "confirmed_high": high}
-    return [f"no result in {failure.attempts} attempts: {failure}" for failure in outcome.failures]
+    return failures
 
 
 def read_claims(folder: Path, reported: Reported) -> dict[str, Any]:

@@ -353,7 +353,6 @@ def test_beyond_runs_each_world_with_each_method(folder, monkeypatch, capsys):
         "CASES",
         {name: beyond.CASES[name] for name in ("1 shepherd", "n = 3")} | {"more": {"scenario": "double.toml"}},
     )
-    monkeypatch.setattr(beyond.campaign, "run", partial(campaign.run, retries=0))
     assert run("beyond", "--controllers", "strombom", "idle", "--json") == 0
     said = json.loads(capsys.readouterr().out)["beyond"]
     table = read("o/beyond.csv")

@@ -12,6 +12,7 @@ import numpy as np
 
 from shepherd_phys.controllers.evaluation import run_episode, trial_seed
 from shepherd_phys.controllers.learned import Policy
+from shepherd_phys.envs._team_world import with_team
 from shepherd_phys.envs.shepherding import ShepherdingEnv
 from shepherd_phys.learning.folder import MEASURES
 from shepherd_phys.learning.preset import Preset
@@ -114,6 +115,4 @@ def _scenario(base: Scenario, point: Mapping[str, Any]) -> Scenario:
     flock = base.flock
     if hasattr(flock, "n_neighbours") and hasattr(flock, "but"):
         flock = flock.but(n_neighbours=point["cohesion"])
-    bodies = base.shepherds
-    team = tuple(bodies[k % len(bodies)] for k in range(point["n_shepherds"]))
-    return base.but(n_flocks=point["n_flocks"], flock=flock, shepherds=team)
+    return with_team(base.but(n_flocks=point["n_flocks"], flock=flock), point["n_shepherds"])
