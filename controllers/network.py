@@ -26,7 +26,8 @@ class SectorNetwork(Settings):
         group g:  relu(W_1 x_g + b_1),  x_g the (R, overlap + group + overlap) numbers of the group and its neighbours
         hidden:   relu(W_2 [all groups] + b_2)
         latent:   tanh(W_3 . + b_3)
-        action:   W_4 . + b_4, the mean of the action's distribution while learning
+        action:   W_4 . + b_4, the mean of the action's distribution
+        its standard deviations:  exp(log_std), with ``scatter`` exp(log_std + 1.5 tanh(W_5 latent))
 
     All groups use the same W_1, as a convolution does, and beams wrap around: the neighbours of the first group are the
     last one's columns. There is no normalisation of any input.
@@ -42,6 +43,9 @@ class SectorNetwork(Settings):
     """Width of the layer over all groups."""
     latent: int = Field(default=64, ge=1, le=4096)
     """Width of the last layer before the action."""
+    scatter: bool = False
+    """Whether how widely actions scatter depends on what is seen: a shepherd that does not know what its fellows will
+    do may try something, and one whose work is done need not."""
 
     def shapes(self, lidar: Lidar) -> dict[str, tuple[int, ...]]:
         """Shape of each weight by name, for observations of these lidar settings.
@@ -71,8 +75,12 @@ class SectorNetwork(Settings):
             "action.weight": (2, self.latent),
             "action.bias": (2,),
             "log_std": (2,),
+            **({"scatter.weight": (2, self.latent)} if self.scatter else {}),
         }
 
+
+SCATTER = 1.5
+"""How far what is seen may move the logarithm of a standard deviation, up or down."""
 
 ARCHITECTURES: dict[str, type[SectorNetwork]] = {"SectorNetwork": SectorNetwork}
 """By name, for policy files."""
@@ -96,7 +104,7 @@ class Actor:
     Args:
         network: its sizes.
         lidar: of the observations.
-        weights: arrays of the names and shapes that ``network.shapes(lidar)`` tells; ``log_std`` is not used.
+        weights: arrays of the names and shapes that ``network.shapes(lidar)`` tells.
     """
 
     def __init__(self, network: SectorNetwork, lidar: Lidar, weights: Weights) -> None:
@@ -108,17 +116,25 @@ class Actor:
             for name in ("groups", "hidden", "latent", "action")
             for array in (np.array(weights[f"{name}.weight"].T, order="C"), np.array(weights[f"{name}.bias"]))
         ]
+        self._log_std = np.array(weights["log_std"])
+        self._scatter = "scatter.weight" in weights
+        if self._scatter:  # two more outputs of the last layer
+            *_, action, bias = self._layers
+            self._layers[-2] = np.concatenate((action, weights["scatter.weight"].T), axis=1)
+            self._layers[-1] = np.concatenate((bias, np.zeros(2, np.float32)))
 
-    def __call__(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(P, 2) actions, not clipped, of P observations (P, R, C) float32."""
+    def __call__(self, observation: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Means and standard deviations (P, 2), not clipped, of the actions for P observations (P, R, C) float32."""
         if observation.shape[1:] != self._shape:
             raise ValueError(
                 f"observation: needs the shape (P, {self._shape[0]}, {self._shape[1]}), has {observation.shape}"
             )
-        actions: NDArray[np.float32] = _forward(
+        outputs: NDArray[np.float32] = _forward(
             np.ascontiguousarray(observation, np.float32), self._group, self._overlap, *self._layers
         )
-        return actions
+        if self._scatter:
+            return outputs[:, :2], np.exp(self._log_std + SCATTER * np.tanh(outputs[:, 2:]), dtype=np.float32)
+        return outputs, np.exp(np.broadcast_to(self._log_std, outputs.shape))
 
 
 @njit(cache=True, error_model="numpy")
@@ -149,7 +165,7 @@ def _forward(observation, group, overlap, w1, b1, w2, b2, w3, b3, w4, b4):  # ty
     latent = np.empty((n, len(b3)), np.float32)
     latent[:] = b3
     _add_layer(latent, hidden, w3)
-    action = np.empty((n, 2), np.float32)
+    action = np.empty((n, len(b4)), np.float32)
     action[:] = b4
     for p in range(n):
         for j in range(len(b3)):

@@ -76,7 +76,7 @@ def test_torch_and_numpy_agree(name, tmp_path):
         wanted = policy.get_distribution({"lidar": torch.from_numpy(observation)}).mode().numpy()
     assert np.abs(wanted).max() > 0.1
     exported = to_policy(policy, spec_of(lidar, network), tmp_path / "p.json")
-    assert Actor(network, lidar, exported.weights)(observation) == pytest.approx(wanted, abs=1e-5)
+    assert Actor(network, lidar, exported.weights)(observation)[0] == pytest.approx(wanted, abs=1e-5)
     back = to_sb3(load_policy(tmp_path / "p.json"), critic_numbers=7)
     action, _ = back.predict({"lidar": observation, "critic": np.zeros((50, 7), np.float32)}, deterministic=True)
     assert action == pytest.approx(np.clip(wanted, -1, 1), abs=1e-6)

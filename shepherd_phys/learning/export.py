@@ -23,7 +23,7 @@ from shepherd_phys.settings import tagged
 def spec_of(preset: Preset, shepherd_steps: int = 0) -> PolicySpec:
     """What the file of a policy trained by ``preset`` says beside its weights."""
     training = preset.to_dict()
-    for name in ("scenario", "lidar", "network", "reward", "effort", "alpha", "credit", "rest"):
+    for name in ("scenario", "lidar", "network", "reward", "effort", "alpha", "credit", "rest", "noise"):
         training.pop(name, None)
     if preset.init is not None:
         training["init"] = Path(preset.init).name  # where it lay is nobody's business
@@ -36,7 +36,9 @@ def spec_of(preset: Preset, shepherd_steps: int = 0) -> PolicySpec:
         scenario=preset.scenario,
         lidar=preset.lidar,
         network=preset.network,
-        action=Acting(frame=preset.lidar.frame, rest=preset.rest),
+        action=Acting(
+            frame=preset.lidar.frame, rest=preset.rest, noise=preset.noise, noise_steps=preset.decision_interval
+        ),
         rewards=rewards,
         training={**training, "algorithm": "PPO of stable-baselines3", "shepherd_steps": shepherd_steps},
     )
@@ -48,12 +50,14 @@ def actor_weights(policy: TeamPolicy) -> dict[str, NDArray[np.float32]]:
 
 
 def load_actor(policy: TeamPolicy, weights: dict[str, NDArray[np.float32]]) -> None:
-    """Put a policy's weights into the actor.
+    """Put a policy's weights into the actor, which may scatter by what it sees though the policy did not.
 
     Raises:
         PolicyError: the network has other sizes.
     """
     actor = _actor(policy)
+    if "scatter.weight" in actor and "scatter.weight" not in weights:
+        weights = {**weights, "scatter.weight": np.zeros(tuple(actor["scatter.weight"].shape), np.float32)}
     for name, parameter in actor.items():
         if name not in weights or tuple(parameter.shape) != weights[name].shape:
             raise PolicyError(f"{name}: the network needs {tuple(parameter.shape)}; the policy's is of another size")
@@ -120,4 +124,7 @@ def _actor(policy: TeamPolicy) -> dict[str, nn.Parameter]:
         "action": policy.action_net,
     }
     named = {f"{name}.{part}": getattr(layer, part) for name, layer in layers.items() for part in ("weight", "bias")}
-    return {**named, "log_std": policy.log_std}
+    named["log_std"] = policy.log_std
+    if policy.scatter is not None:
+        named["scatter.weight"] = policy.scatter.weight
+    return named

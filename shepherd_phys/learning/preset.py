@@ -115,8 +115,10 @@ class Preset(Settings):
     alpha: float | None = Field(default=None, ge=0)
     """Least useful distance of the occlusion term [m]; none: the scheme's."""
     rest: float = Field(default=0.0, ge=0, lt=1)
-    """Of the policy when it is deployed, and validated: wanted speeds below this part of the top speed mean standing
-    still. Learning does not know of it."""
+    """Wanted speeds below this part of the top speed mean standing still, while learning and when deployed."""
+    noise: float = Field(default=0.0, ge=0, le=1)
+    """Of the policy when it is deployed, and validated: standard deviations by which its actions scatter about their
+    mean, each for as long as a decision while learning; see `shepherd_phys.controllers.policy_files.Acting`."""
     credit: Literal["own", "team"] = "own"
     """Who is paid for a term that has shares: each shepherd by its own, or all by the mean."""
     decision_interval: int = Field(default=5, ge=1)
@@ -225,6 +227,8 @@ class Preset(Settings):
         policy = POLICIES[name]() if name in POLICIES else load_policy(name)
         for part in ("lidar", "network"):
             theirs, ours = getattr(policy.spec, part), getattr(self, part)
+            if part == "network" and not policy.spec.network.scatter:
+                ours = ours.but(scatter=False)  # it can begin to
             if theirs != ours:
                 raise SettingsError(f"init: {name} has another {part} than the preset: {theirs}, not {ours}")
         return policy
