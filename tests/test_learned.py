@@ -159,6 +159,31 @@ def test_a_decision_is_held_for_its_interval():
     assert same == [True, True, False, True, True]
 
 
+@pytest.mark.parametrize("scatter", [False, True])
+def test_chance_is_drawn_anew_after_its_time_in_proportion_to_the_deviation_and_from_the_seed(scatter):
+    lidar, network = Lidar(beams=16, stack=1), SMALL.but(scatter=scatter)
+    weights = random_weights(network, lidar)
+    weights["log_std"][:] = (-2.0, -1.0)
+    for name in ("action.weight", "action.bias"):
+        weights[name] *= 0.1
+    seen = np.random.default_rng(1).random((5, 3, 16), dtype=np.float32)
+    mean, deviation = Actor(network, lidar, weights)(seen)
+
+    def acts(noise, seed, n_steps=7):
+        policy = Policy(spec_of(lidar, network, noise=noise, noise_steps=3), weights)
+        policy.reset(np.random.default_rng(seed))
+        return np.array([policy.act(seen, STATE.but(step=k)) for k in range(n_steps)])
+
+    added = (acts(0.5, 7) - mean) / deviation
+    same = [np.allclose(a, b) for a, b in itertools.pairwise(added)]
+    assert same == [True, True, False, True, True, False]
+    drawn = 0.5 * np.random.default_rng(7).standard_normal((3, 5, 2))
+    assert added[[0, 3, 6]] == pytest.approx(drawn, abs=1e-4)
+    np.testing.assert_array_equal(acts(0.5, 7), acts(0.5, 7))
+    np.testing.assert_array_equal(acts(0.0, 7), acts(0.0, 8))
+    assert (acts(0.0, 7) == pytest.approx(np.tile(mean, (7, 1, 1)))) and not np.array_equal(acts(0.5, 7), acts(0.5, 8))
+
+
 def test_less_than_the_least_speed_is_standing_still():
     lidar = Lidar(beams=16, stack=1)
     weights = random_weights(SMALL, lidar, 3)

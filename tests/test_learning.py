@@ -1,5 +1,7 @@
 """Networks, export and learning: torch and numpy agree; the actor sees its lidar alone; a NaN is named."""
 
+from contextlib import closing
+
 import numpy as np
 import pytest
 import torch
@@ -9,13 +11,13 @@ from test_learned import LIDAR, SMALL, random_weights, spec_of
 
 from shepherd_phys.controllers import Policy, load_policy
 from shepherd_phys.controllers.network import Actor, SectorNetwork, input_shape
-from shepherd_phys.controllers.policy_files import PolicyError
+from shepherd_phys.controllers.policy_files import Acting, PolicyError
 from shepherd_phys.envs.rewards import SCHEMES
 from shepherd_phys.envs.team import TeamVecEnv
 from shepherd_phys.learning.export import actor_weights, load_actor, to_policy, to_sb3
 from shepherd_phys.learning.export import spec_of as spec_of_preset
 from shepherd_phys.learning.network import TeamPolicy
-from shepherd_phys.learning.ppo import Learner, TrainingError
+from shepherd_phys.learning.ppo import Learner, TrainingError, _Resting
 from shepherd_phys.learning.preset import PRESETS, CriticNetwork, PPOSettings, Preset, Validation, load_preset
 from shepherd_phys.learning.validation import Validator
 from shepherd_phys.lidar import Lidar
@@ -58,6 +60,7 @@ CASES = {
     "fast": (Lidar(sectors=64, frame="goal"), SectorNetwork()),
     "fast, overlapping": (Lidar(sectors=64, frame="goal"), SectorNetwork(overlap=3)),
     "paper": (Lidar(), SectorNetwork(group=8)),
+    "scatter": (Lidar(sectors=64, frame="goal"), SectorNetwork(scatter=True)),
     "four channels": (Lidar(channels=("sheep", "shepherds", "goal", "obstacles"), sectors=64), SectorNetwork()),
 }
 
@@ -73,10 +76,13 @@ def test_torch_and_numpy_agree(name, tmp_path):
     shape = (50, *input_shape(lidar))
     observation = rng.random(shape, dtype=np.float32) * (rng.random(shape) < rng.random((50, 1, 1)))
     with torch.no_grad():
-        wanted = policy.get_distribution({"lidar": torch.from_numpy(observation)}).mode().numpy()
+        wanted_of = policy.get_distribution({"lidar": torch.from_numpy(observation)})
+        wanted, deviation = wanted_of.mode().numpy(), wanted_of.distribution.stddev.numpy()
     assert np.abs(wanted).max() > 0.1
     exported = to_policy(policy, spec_of(lidar, network), tmp_path / "p.json")
-    assert Actor(network, lidar, exported.weights)(observation)[0] == pytest.approx(wanted, abs=1e-5)
+    acts, scatters = Actor(network, lidar, exported.weights)(observation)
+    assert acts == pytest.approx(wanted, abs=1e-5) and scatters == pytest.approx(deviation, abs=1e-5)
+    assert (np.ptp(scatters, axis=0) > 0.01).all() == network.scatter
     back = to_sb3(load_policy(tmp_path / "p.json"), critic_numbers=7)
     action, _ = back.predict({"lidar": observation, "critic": np.zeros((50, 7), np.float32)}, deterministic=True)
     assert action == pytest.approx(np.clip(wanted, -1, 1), abs=1e-6)
@@ -121,6 +127,28 @@ def test_only_a_model_of_the_right_sizes_becomes_a_policy():
     env.close()
     with pytest.raises(PolicyError, match="of another size"):
         load_actor(policy_of(LIDAR, SMALL), random_weights(SMALL.but(hidden=9), LIDAR))
+
+
+def test_a_policy_may_begin_to_scatter_by_what_it_sees():
+    policy = policy_of(LIDAR, SMALL.but(scatter=True))
+    assert set(actor_weights(policy)) == set(SMALL.but(scatter=True).shapes(LIDAR))
+    plain = random_weights(SMALL, LIDAR, seed=9)
+    load_actor(policy, plain)
+    observation = np.random.default_rng(0).random((4, 6, 16), dtype=np.float32)
+    with torch.no_grad():
+        deviation = policy.get_distribution({"lidar": torch.from_numpy(observation)}).distribution.stddev.numpy()
+    assert deviation == pytest.approx(np.tile(np.exp(plain["log_std"]), (4, 1)))  # until it has learned otherwise
+    with pytest.raises(PolicyError, match=r"scatter.weight|another size"):
+        load_actor(policy_of(LIDAR, SMALL.but(scatter=True, latent=9)), plain)
+
+
+def test_what_is_too_slow_stands_still_while_learning_too(monkeypatch):
+    worlds, moved = TeamVecEnv(TINY.scenario, (3,), lidar=LIDAR), []
+    monkeypatch.setattr(worlds, "step_async", moved.append)
+    _Resting(worlds, 0.2).step_async(np.array([[0.1, 0.1], [0.2, 0.0], [-0.3, 0.4]], np.float32))
+    np.testing.assert_array_equal(moved[0], np.array([[0.0, 0.0], [0.2, 0.0], [-0.3, 0.4]], np.float32))
+    with closing(Learner(TINY)) as plain, closing(Learner(TINY.but(rest=0.2))) as rests:
+        assert isinstance(rests.rewards.venv, _Resting) and plain.rewards.venv is plain.env
 
 
 def test_a_live_model_is_exported_and_goes_on(learner, tmp_path):
@@ -288,8 +316,10 @@ def test_a_preset_may_mix_worlds_and_price_effort():
     assert 1 <= drawn.n_flocks <= 3 and drawn.flock == TINY.scenario.flock
     assert preset.scheme()["effort"][0] == -2.0 and preset.scheme()["gathered"][0] == 3.0
     assert set(TINY.scheme()) == set(SCHEMES["wild"])
-    spec = spec_of_preset(TINY.but(rest=0.25))
-    assert (spec.action.rest, spec_of_preset(TINY).action.rest) == (0.25, 0.0) and "rest" not in spec.training
+    spec = spec_of_preset(TINY.but(rest=0.25, noise=0.5))
+    assert spec.action == Acting(frame="goal", rest=0.25, noise=0.5, noise_steps=TINY.decision_interval)
+    assert spec_of_preset(TINY).action == Acting(frame="goal", noise_steps=TINY.decision_interval)
+    assert not {"rest", "noise"} & set(spec.training)
     far = TINY.but(flock_distance=(4.0, 5.0), uneven=1.0).draw()(np.random.default_rng(0), 0)
     assert far.flock_distance == (4.0, 5.0) and far.flock_sizes is not None and far.n_flocks == TINY.scenario.n_flocks
     assert TINY.but(flock_distance=(4.0, 5.0)).draw() == TINY.scenario.but(flock_distance=(4.0, 5.0))
