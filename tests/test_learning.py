@@ -352,7 +352,7 @@ THREE = ("sheep", "shepherds", "goal")
 
 @pytest.mark.parametrize(
     ("lidar", "channels"),
-    [("", CHANNELS), ("[lidar]\nsectors = 64", CHANNELS), (f"[lidar]\nchannels = {list(THREE)}", THREE)],
+    [("", CHANNELS), ("[lidar]\nsectors = 64", CHANNELS), (f"[lidar]\nsectors = 64\nchannels = {list(THREE)}", THREE)],
 )
 def test_channels_follow_from_the_scenario_unless_they_are_given(lidar, channels, tmp_path):
     (tmp_path / "mine.toml").write_text(WALLS + lidar)

@@ -101,14 +101,16 @@ def train(
         newest = saved = checkpoints.load_latest(folder / CHECKPOINTS)
         if newest is not None and not ended(newest, preset, seconds):
             saved = _gone_on_from(newest, preset, folder / CHECKPOINTS)
-            _forget(folder, newest, saved)
-        if preset != kept:
-            preset.to_toml(folder / PRESET)
         decisions = 0 if saved is None else int(saved.facts["decisions"])
         logger = Logger(str(folder / TENSORBOARD), [_TensorBoard(folder / TENSORBOARD, decisions)])
         learner = Learner(preset, n_workers if n_workers > 1 else 0, logger, fresh=saved is None)
         try:
             with validator(preset, n_workers) as validate:
+                # only now: until here a mistake leaves the run as it was
+                if preset != kept:
+                    preset.to_toml(folder / PRESET)
+                if newest is not None and saved is not newest:
+                    _forget(folder, newest, saved)
                 run = _Run(folder, learner, validate, report, saved, seconds)
                 while not run.over:
                     run.interval()
@@ -125,7 +127,7 @@ def _gone_on_from(newest: Checkpoint, preset: Preset, folder: Path) -> Checkpoin
     """The last checkpoint that a longer run would have written, too; None where it lies before the first.
 
     Raises:
-        CheckpointError: it was there and is damaged.
+        CheckpointError: it is not there whole.
     """
     if _in_turn(newest, preset):
         return newest
