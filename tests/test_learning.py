@@ -20,7 +20,8 @@ from shepherd_phys.learning.network import TeamPolicy
 from shepherd_phys.learning.ppo import Learner, TrainingError, _Resting
 from shepherd_phys.learning.preset import PRESETS, CriticNetwork, PPOSettings, Preset, Validation, load_preset
 from shepherd_phys.learning.validation import Validator
-from shepherd_phys.lidar import Lidar
+from shepherd_phys.lidar import CHANNELS, Lidar
+from shepherd_phys.obstacles import Pillar
 from shepherd_phys.scenario import SCENARIOS
 from shepherd_phys.settings import SettingsError
 
@@ -349,6 +350,22 @@ def test_a_preset_may_mix_worlds_and_price_effort():
         ("[scenario]\nshepherds = 0", "scenario.shepherds: there must be one"),
         ("[scenario]\nflock_sizes = [60, 40]", "scenario.flock_sizes: validation has other numbers"),
         ("[scenario]\nn_sheep = 4", "validation.flocks: 5 flocks of 4 sheep cannot be"),
+        ("worlds = 1_000_000_000", "worlds: Input should be less than or equal to 10000 .given: 1000000000.$"),
+        ("team_sizes = [1_000_000_000]", "team_sizes.*less than or equal to 10000"),
+        ("worlds = 10_000\nteam_sizes = [10_000]", "worlds, team_sizes, lidar: .* numbers of frames to remember"),
+        ("[ppo]\nn_steps = 1_000_000_000", "n_steps.*less than or equal to"),
+        (
+            "[ppo]\nn_steps = 1_000_000",
+            "worlds, team_sizes, ppo.n_steps, lidar: .* numbers observed in a rollout; at most",
+        ),
+        ("[scenario]\nn_sheep = 1_000_000_000", "worlds, scenario.n_sheep: 64000000000 sheep; at most"),
+        ("[lidar]\nstack = 1000\nstack_stride = 1000", "lidar: .* numbers of frames to remember; a policy may have"),
+        ("[network]\nhidden = 4096\nfeatures = 4096", "network: .* bytes of weights; a policy may have"),
+        ("[validation]\ntrials = 1_000_000_000", "trials.*less than or equal to"),
+        ("[validation]\ntrials = 1_000_000", "3 points x 1000000 trials: at most 1000000 episodes"),
+        ("checkpoint_rollouts = 10_000_000_000", "checkpoint_rollouts.*less than or equal to"),
+        ("seed = 100_000_000_000_000_000_000", "seed"),
+        ("threads = 1_000_000", "threads.*less than or equal to"),
         ("budget =", "is not a TOML file"),
     ],
 )
@@ -357,6 +374,34 @@ def test_a_wrong_preset_is_one_error(text, said, tmp_path):
     with pytest.raises(SettingsError, match=said) as caught:
         load_preset(tmp_path / "mine.toml")
     assert "mine.toml" in str(caught.value) and "\n" not in str(caught.value)
+
+
+WALLS = "[scenario]\nobstacles = [{kind = 'Pillar', center = [8.0, 0.0], radius = 1.0}]\n"
+THREE = ("sheep", "shepherds", "goal")
+
+
+@pytest.mark.parametrize(
+    ("lidar", "channels"),
+    [("", CHANNELS), ("[lidar]\nsectors = 64", CHANNELS), (f"[lidar]\nsectors = 64\nchannels = {list(THREE)}", THREE)],
+)
+def test_channels_follow_from_the_scenario_unless_they_are_given(lidar, channels, tmp_path):
+    (tmp_path / "mine.toml").write_text(WALLS + lidar)
+    preset = load_preset(tmp_path / "mine.toml")
+    assert preset.lidar.channels == channels and preset.lidar.sectors == 64
+    preset.to_toml(tmp_path / "again.toml")
+    assert load_preset(tmp_path / "again.toml") == preset
+    (tmp_path / "mine.toml").write_text(lidar)
+    assert load_preset(tmp_path / "mine.toml").lidar.channels == THREE
+
+
+def test_channels_follow_from_another_scenario():
+    walled = SCENARIOS["small"].but(obstacles=(Pillar(center=(8.0, 0.0), radius=1.0),))
+    assert Preset(scenario=walled).lidar == Preset().lidar.but(channels=CHANNELS)
+    assert TINY.but(scenario=walled).lidar == LIDAR.but(channels=CHANNELS)
+    assert TINY.but(scenario=walled).but(scenario=TINY.scenario) == TINY
+    assert TINY.but(scenario=walled, lidar=LIDAR).lidar == LIDAR
+    goal_alone = Lidar(channels=("sheep", "goal"), sectors=16)
+    assert TINY.but(lidar=goal_alone).but(scenario=walled).lidar == goal_alone
 
 
 def test_a_preset_that_is_not_there_is_one_error(tmp_path):
