@@ -137,7 +137,7 @@ class Preset(Settings):
     """Least useful distance of the occlusion term [m]; none: the scheme's."""
     rest: float = Field(default=0.0, ge=0, lt=1)
     """Wanted speeds below this part of the top speed mean standing still, while learning and when deployed."""
-    noise: float = Field(default=0.0, ge=0, le=1)
+    noise: float = Field(default=0.3, ge=0, le=1)
     """Of the policy when it is deployed, and validated: standard deviations by which its actions scatter about their
     mean, each for as long as a decision while learning; see `shepherd_phys.controllers.policy_files.Acting`."""
     credit: Literal["own", "team"] = "own"
