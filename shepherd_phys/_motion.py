@@ -66,9 +66,9 @@ def measure(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Write what a state holds; whether all is finite.
 
-    ``vectors`` (3 N + 2 P, 2) positions, velocities and headings of the sheep, positions and velocities of the shepherds;
-    ``numbers`` (N + 2 P,) distances of the sheep to the goal, angles and ways walked of the shepherds; ``flags`` (2, N)
-    in the goal now and ever; ``poses`` of all.
+    ``vectors`` (3 N + 2 P, 2) positions, velocities and headings of the sheep, positions and velocities of the
+    shepherds; ``numbers`` (N + 2 P,) distances of the sheep to the goal, angles and ways walked of the shepherds;
+    ``flags`` (2, N) in the goal now and ever; ``poses`` of all.
     """
     n, p = len(heading), len(previous)
     pos, vel, turned = vectors[:n], vectors[n : 2 * n], vectors[2 * n : 3 * n]

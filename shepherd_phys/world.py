@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -395,8 +394,8 @@ class World:
     ) -> WorldState:
         """Make the state of what was read."""
         scenario, n, p = self.scenario, self._n, self._p
-        # allocated here and not in the kernel: handing arrays over costs less than bringing them back; and few of them, of
-        # which the state's are slices: to make and to freeze each by itself took longer than to fill them
+        # allocated here and not in the kernel: handing arrays over costs less than bringing them back; and few of them,
+        # of which the state's are slices: to make and to freeze each by itself took longer than to fill them
         vectors, numbers, flags = np.empty((3 * n + 2 * p, 2)), np.empty(n + 2 * p), np.empty((2, n), np.bool_)
         if not _motion.measure(
             rows, self._command, heading, arrived, previous, path, self._goal, scenario.goal_radius,
@@ -448,5 +447,5 @@ class World:
         for name in sets:
             if name not in SHEEP_SETS:
                 raise ValueError(f"sets: {name!r} is not one of {', '.join(SHEEP_SETS)}")
-        masks: Mapping[str, NDArray[np.bool_]] = {name: SHEEP_SETS[name](state) for name in sets}
+        masks = {name: SHEEP_SETS[name](state) for name in sets}
         return sensor.scan(self._poses, state.goal_pos, state.goal_radius, masks)
