@@ -214,7 +214,7 @@ class Sensor:
         lidar = self.lidar
         _raycast.scan_shapes(
             out,
-            self._geometry.shapes,
+            *self._geometry.shapes,
             self._poses,
             self._n_sheep,
             self._goal,
@@ -387,9 +387,6 @@ def _goal_offsets(rows: Proximities, first: int, last: NDArray[np.int64], lidar:
 def turn(action: NDArray[Any], offset: NDArray[np.int64], beams: int) -> NDArray[Any]:
     """Vectors (P, 2) of the observed frame in world axes: turned by the angle of beam ``offset`` (P,)."""
     angle = (2.0 * np.pi / beams) * offset
-    ca, sa = np.cos(angle), np.sin(angle)
-    x, y = action[..., 0], action[..., 1]
     turned = np.empty(action.shape, np.result_type(action.dtype, np.float32))
-    turned[..., 0] = ca * x - sa * y
-    turned[..., 1] = sa * x + ca * y
+    _frames.turned(action, np.cos(angle), np.sin(angle), turned)
     return turned
