@@ -98,8 +98,8 @@ class TeamPolicy(MultiInputActorCriticPolicy):
         world = self.critic.world if "critic" in space.spaces else 0
         return SectorFeatures(space, self.network, self.critic.hidden, world)
 
-    def extract_features(
-        self, obs: dict[str, torch.Tensor], features_extractor: BaseFeaturesExtractor | None = None
+    def extract_features(  # type: ignore[override]
+        self, obs: Any, features_extractor: BaseFeaturesExtractor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """The actor's and the critic's. Both cut the lidar alike: once for both, since that copies the observations."""
         actor, critic = self.pi_features_extractor, self.vf_features_extractor
