@@ -1,7 +1,5 @@
 """Networks, export and learning: torch and numpy agree; the actor sees its lidar alone; a NaN is named."""
 
-from contextlib import closing
-
 import numpy as np
 import pytest
 import torch
@@ -17,7 +15,7 @@ from shepherd_phys.envs.team import TeamVecEnv
 from shepherd_phys.learning.export import actor_weights, load_actor, to_policy, to_sb3
 from shepherd_phys.learning.export import spec_of as spec_of_preset
 from shepherd_phys.learning.network import TeamPolicy
-from shepherd_phys.learning.ppo import Learner, TrainingError, _Resting
+from shepherd_phys.learning.ppo import Learner, TrainingError
 from shepherd_phys.learning.preset import PRESETS, CriticNetwork, PPOSettings, Preset, Validation, load_preset
 from shepherd_phys.learning.validation import Validator
 from shepherd_phys.lidar import CHANNELS, Lidar
@@ -141,15 +139,6 @@ def test_a_policy_may_begin_to_scatter_by_what_it_sees():
     assert deviation == pytest.approx(np.tile(np.exp(plain["log_std"]), (4, 1)))  # until it has learned otherwise
     with pytest.raises(PolicyError, match=r"scatter.weight|another size"):
         load_actor(policy_of(LIDAR, SMALL.but(scatter=True, latent=9)), plain)
-
-
-def test_what_is_too_slow_stands_still_while_learning_too(monkeypatch):
-    worlds, moved = TeamVecEnv(TINY.scenario, (3,), lidar=LIDAR), []
-    monkeypatch.setattr(worlds, "step_async", moved.append)
-    _Resting(worlds, 0.2).step_async(np.array([[0.1, 0.1], [0.2, 0.0], [-0.3, 0.4]], np.float32))
-    np.testing.assert_array_equal(moved[0], np.array([[0.0, 0.0], [0.2, 0.0], [-0.3, 0.4]], np.float32))
-    with closing(Learner(TINY)) as plain, closing(Learner(TINY.but(rest=0.2))) as rests:
-        assert isinstance(rests.rewards.venv, _Resting) and plain.rewards.venv is plain.env
 
 
 def test_a_live_model_is_exported_and_goes_on(learner, tmp_path):

@@ -14,7 +14,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.utils import set_random_seed
-from stable_baselines3.common.vec_env import VecEnvWrapper, VecNormalize
+from stable_baselines3.common.vec_env import VecNormalize
 
 from shepherd_phys.envs.team import TeamVecEnv
 from shepherd_phys.learning.export import _actor, load_actor
@@ -62,8 +62,7 @@ class Learner:
         )
         self._steps_before = 0
         # rewards over the running deviation of discounted returns: the schemes differ in scale
-        moved = _Resting(self.env, preset.rest) if preset.rest else self.env
-        self.rewards = VecNormalize(moved, norm_obs=False, gamma=ppo.gamma)
+        self.rewards = VecNormalize(self.env, norm_obs=False, gamma=ppo.gamma)
         self._seed_learner(0)
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message=".*mini-batch size of")  # the last one may be smaller
@@ -229,24 +228,6 @@ LOGGED = (
 """What of PPO's own measures goes into the curve."""
 EPISODE = {"episode_reward": "return", "in_goal": "in_goal", "path_length": "path_length"}
 """Measures of whole episodes in the curve, and their names in the env's infos."""
-
-
-class _Resting(VecEnvWrapper):
-    """Actions shorter than ``rest`` mean standing still, as when the policy is deployed."""
-
-    def __init__(self, env: TeamVecEnv, rest: float) -> None:
-        super().__init__(env)
-        self._rest = rest
-
-    def reset(self) -> Any:
-        return self.venv.reset()
-
-    def step_async(self, actions: Array) -> None:
-        moves = np.linalg.norm(actions, axis=1, keepdims=True) >= self._rest
-        self.venv.step_async(np.where(moves, actions, 0.0))
-
-    def step_wait(self) -> Any:
-        return self.venv.step_wait()
 
 
 class _Watch(BaseCallback):

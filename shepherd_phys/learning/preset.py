@@ -136,7 +136,8 @@ class Preset(Settings):
     alpha: float | None = Field(default=None, ge=0)
     """Least useful distance of the occlusion term [m]; none: the scheme's."""
     rest: float = Field(default=0.0, ge=0, lt=1)
-    """Wanted speeds below this part of the top speed mean standing still, while learning and when deployed."""
+    """Of the policy when it is deployed, and validated: wanted speeds below this part of the top speed mean standing
+    still. Not while learning: whoever wants to stand still and tries little beside could learn nothing else."""
     noise: float = Field(default=0.3, ge=0, le=1)
     """Of the policy when it is deployed, and validated: standard deviations by which its actions scatter about their
     mean, each for as long as a decision while learning; see `shepherd_phys.controllers.policy_files.Acting`."""
