@@ -67,10 +67,11 @@ def _place(away: float, rings: Floats) -> tuple[int, float]:
 @njit(cache=True)
 def _count(cells: Floats, ring: int, outer: float, bearing: float, amount: float) -> None:
     """Share an amount between the four cells (rings, bearings) about a place; ``bearing`` counts cells."""
+    n = cells.shape[1]
     whole = math.floor(bearing)
     part = bearing - whole
-    left = int(whole) % N_BEARINGS  # a constant: no division
-    right = (left + 1) % N_BEARINGS
+    left = int(whole) % n
+    right = (left + 1) % n
     cells[ring, left] += amount * (1.0 - outer) * (1.0 - part)
     cells[ring, right] += amount * (1.0 - outer) * part
     if outer > 0.0:

@@ -243,11 +243,7 @@ def _in_world(shapes: Shapes, poses: Floats) -> Shapes:
 @njit(cache=True, error_model="numpy")
 def scan_shapes(
     out: Floats,
-    shapes_table: Ints,
-    shapes_radius: Floats,
-    shapes_corners: Floats,
-    shapes_boxes: Floats,
-    shapes_boxed: bool,
+    shapes: Shapes,
     poses: Floats,
     n_sheep: int,
     goal: Floats,
@@ -265,11 +261,7 @@ def scan_shapes(
 
     Args:
         out: (channels, P, beams) readings [m], overwritten.
-        shapes_table: the shapes; these five are `Shapes`, handed over one by one: to unpack a tuple takes longer.
-        shapes_radius: as there.
-        shapes_corners: as there.
-        shapes_boxes: as there.
-        shapes_boxed: as there.
+        shapes: the shapes.
         poses: (N + P, 3) x, y [m], angle [rad] of the bodies; sheep first.
         n_sheep: N.
         goal: (3,) centre and radius [m].
@@ -284,7 +276,6 @@ def scan_shapes(
         cut: whether obstacles cut the other channels; needs their row.
     """
     beams, n_masks = out.shape[2], len(masks)
-    shapes = Shapes(shapes_table, shapes_radius, shapes_corners, shapes_boxes, shapes_boxed)
     world = _in_world(shapes, poses)
     table, radius, corners = world.table, world.radius, world.corners
     hit, far = np.empty(2 * beams), np.empty((1, 1, beams))

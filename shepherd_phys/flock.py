@@ -77,14 +77,12 @@ class Strombom(Settings):
         is the angle over 2 pi of its step, or of eps.
         """
         draws = rng.random((state.n_sheep, 2))
-        velocity = np.empty((state.n_sheep, 2))
-        desired(
+        return desired(
             state.sheep_pos, state.sheep_heading, state.sheep_max_speed, state.shepherd_pos, draws,
             self.inertia, self.attraction, self.repulsion, self.flight, self.noise,
             self.detection_radius, self.sheep_distance, self.n_neighbours, self.graze_probability,
-            state.n_sheep >= GRID_FROM, velocity,
+            state.n_sheep >= GRID_FROM,
         )  # fmt: skip
-        return velocity
 
 
 FLOCKS: dict[str, type[Any]] = {"Strombom": Strombom}
@@ -126,8 +124,8 @@ def flight(sheep: Floats, shepherds: Floats, r_s: float) -> tuple[NDArray[np.boo
 def desired(
     sheep: Floats, heading: Floats, speed: Floats, shepherds: Floats, draws: Floats,
     h: float, c: float, rho_a: float, rho_s: float, e: float, r_s: float, r_a: float, n: int, p: float,
-    use_grid: bool, velocity: Floats,
-) -> None:  # fmt: skip
+    use_grid: bool,
+) -> Floats:  # fmt: skip
     """The rule of `Strombom`, for the whole flock at once.
 
     Args:
@@ -146,9 +144,11 @@ def desired(
         n: neighbours.
         p: probability of a step while grazing.
         use_grid: find neighbours through a grid; the same neighbours, faster for large flocks.
-        velocity: (N, 2) overwritten with v* [m/s]: to bring a new array back costs more than to hand one over.
+
+    Returns:
+        (N, 2) v* [m/s].
     """
-    velocity[:] = 0.0
+    velocity = np.zeros((len(sheep), 2))
     threatened, away = flight(sheep, shepherds, r_s)
     if threatened.any():
         towards, apart = surroundings(sheep, threatened, n, r_a, use_grid, np.empty((0, 0), np.int64))
@@ -169,3 +169,4 @@ def desired(
             x, y = heading[i, 0], heading[i, 1]
         ux, uy = _unit(x, y)
         velocity[i, 0], velocity[i, 1] = speed[i] * ux, speed[i] * uy
+    return velocity

@@ -214,7 +214,7 @@ class Sensor:
         lidar = self.lidar
         _raycast.scan_shapes(
             out,
-            *self._geometry.shapes,
+            self._geometry.shapes,
             self._poses,
             self._n_sheep,
             self._goal,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -447,5 +448,5 @@ class World:
         for name in sets:
             if name not in SHEEP_SETS:
                 raise ValueError(f"sets: {name!r} is not one of {', '.join(SHEEP_SETS)}")
-        masks = {name: SHEEP_SETS[name](state) for name in sets}
+        masks: Mapping[str, NDArray[np.bool_]] = {name: SHEEP_SETS[name](state) for name in sets}
         return sensor.scan(self._poses, state.goal_pos, state.goal_radius, masks)

@@ -89,14 +89,14 @@ def naive(m, state, draws):
 
 def both(model, state, draws):
     """Velocities by brute force and by the grid."""
-    velocities = np.full((2, len(state.sheep_pos), 2), np.nan)
-    for use_grid, velocity in zip((False, True), velocities, strict=True):
+    return [
         desired(
             state.sheep_pos, state.sheep_heading, state.sheep_max_speed, state.shepherd_pos, draws, model.inertia,
             model.attraction, model.repulsion, model.flight, model.noise, model.detection_radius,
-            model.sheep_distance, model.n_neighbours, model.graze_probability, use_grid, velocity,
-        )  # fmt: skip
-    return list(velocities)
+            model.sheep_distance, model.n_neighbours, model.graze_probability, use_grid,
+        )
+        for use_grid in (False, True)
+    ]  # fmt: skip
 
 
 # Each term alone, by hand
