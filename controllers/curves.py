@@ -6,8 +6,8 @@ range from its final value.
 
 Every curve comes within that band of its own last value in the end, even one that rises to its end. So a curve that
 does so only in its **tail**, the last `TAIL` of its shepherd-steps and at least the last `WINDOW` evaluations, has
-**not levelled off**. Where a longer run would have is not known, not even that it would not have before the tail: another
-final value may put that into the band, too.
+**not levelled off**. Where a longer run would have is not known, not even that it would not have before the tail:
+another final value may put that into the band, too.
 """
 
 from __future__ import annotations
