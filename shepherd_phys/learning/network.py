@@ -6,12 +6,11 @@ from typing import Any
 
 import torch
 from gymnasium import spaces
-from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution
 from stable_baselines3.common.policies import MultiInputActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, MlpExtractor
 from torch import nn
 
-from shepherd_phys.controllers.network import SCATTER, SectorNetwork
+from shepherd_phys.controllers.network import SectorNetwork
 from shepherd_phys.learning.preset import CriticNetwork
 
 
@@ -112,15 +111,3 @@ class TeamPolicy(MultiInputActorCriticPolicy):
         heads.value_net = nn.Sequential(nn.Linear(self.critic.hidden, self.critic.latent), nn.Tanh()).to(self.device)
         heads.latent_dim_vf = self.critic.latent
         self.mlp_extractor = heads
-        self.scatter: nn.Linear | None = None
-        if self.network.scatter:
-            self.scatter = nn.Linear(self.network.latent, 2, bias=False)
-            nn.init.zeros_(self.scatter.weight)  # at first it is the same everywhere
-
-    def _get_action_dist_from_latent(self, latent_pi: torch.Tensor) -> Distribution:
-        """The actions' distribution; see `SectorNetwork`."""
-        log_std: torch.Tensor = self.log_std
-        if self.scatter is not None:
-            log_std = log_std + SCATTER * torch.tanh(self.scatter(latent_pi))
-        assert isinstance(self.action_dist, DiagGaussianDistribution)
-        return self.action_dist.proba_distribution(self.action_net(latent_pi), log_std)

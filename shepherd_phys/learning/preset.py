@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BeforeValidator, Field
 
 from shepherd_phys.controllers.learned import POLICIES, Policy, load_policy
-from shepherd_phys.controllers.network import SectorNetwork, input_shape
+from shepherd_phys.controllers.network import SectorNetwork, input_shape, without_scatter
 from shepherd_phys.controllers.policy_files import MAX_FRAMES, MAX_WEIGHTS
 from shepherd_phys.envs.mixture import Mixture
 from shepherd_phys.envs.rewards import SCHEMES, Effort, Gathered, Occlusion, Term
@@ -301,8 +301,6 @@ class Preset(Settings):
         policy = POLICIES[name]() if name in POLICIES else load_policy(name)
         for part in ("lidar", "network"):
             theirs, ours = getattr(policy.spec, part), getattr(self, part)
-            if part == "network" and not policy.spec.network.scatter:
-                ours = ours.but(scatter=False)  # it can begin to
             if theirs != ours:
                 raise SettingsError(f"init: {name} has another {part} than the preset: {theirs}, not {ours}")
         return policy
@@ -344,7 +342,7 @@ class Preset(Settings):
 PARTS: dict[str, Callable[[Mapping[str, Any]], Any]] = {
     "scenario": Scenario.from_dict,
     "lidar": lambda table: Lidar(**table),
-    "network": lambda table: SectorNetwork(**table),
+    "network": lambda table: SectorNetwork(**without_scatter(table)),
     "critic": lambda table: CriticNetwork(**table),
     "ppo": lambda table: PPOSettings(**table),
     "validation": lambda table: Validation(**table),
