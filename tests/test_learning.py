@@ -323,6 +323,7 @@ def test_a_preset_may_mix_worlds_and_price_effort():
     [
         ("reward = 'wold'", "'wold' is not one of original, any, wild"),
         ("rewards = 'wild'", "rewards: there is no such field"),
+        ("decision_interval = 1001", "decision_interval.*less than or equal to 1000"),
         ("budget = 0", "budget.*greater than or equal to 1"),
         ("team_sizes = []", "team_sizes"),
         ("team_sizes = [0]", "team_sizes"),
@@ -408,3 +409,7 @@ def test_a_policy_that_was_trained_deploys_where_it_was_not(learner):
     assert isinstance(policy, Policy)
     rows = Validator(TINY.but(validation=Validation(flocks=(3,), shepherds=(1, 6), trials=1)))(policy)
     assert [row["n_shepherds"] for row in rows] == [1, 6]
+
+
+def test_the_longest_decision_can_be_exported():
+    assert spec_of_preset(TINY.but(decision_interval=1000)).action.noise_steps == 1000

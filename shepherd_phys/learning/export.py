@@ -15,7 +15,7 @@ from torch import nn
 
 from shepherd_phys.controllers.learned import Policy
 from shepherd_phys.controllers.network import input_shape
-from shepherd_phys.controllers.policy_files import Acting, PolicyError, PolicySpec, write_policy
+from shepherd_phys.controllers.policy_files import PolicyError, PolicySpec, write_policy
 from shepherd_phys.learning.network import SectorFeatures, TeamPolicy
 from shepherd_phys.learning.preset import CriticNetwork, Preset
 from shepherd_phys.settings import tagged
@@ -37,9 +37,7 @@ def spec_of(preset: Preset, shepherd_steps: int = 0) -> PolicySpec:
         scenario=preset.scenario,
         lidar=preset.lidar,
         network=preset.network,
-        action=Acting(
-            frame=preset.lidar.frame, rest=preset.rest, noise=preset.noise, noise_steps=preset.decision_interval
-        ),
+        action=preset.acting(),
         rewards=rewards,
         training={**training, "algorithm": "PPO of stable-baselines3", "shepherd_steps": shepherd_steps},
     )

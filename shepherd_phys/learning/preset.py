@@ -11,7 +11,7 @@ from pydantic import BeforeValidator, Field
 
 from shepherd_phys.controllers.learned import POLICIES, Policy, load_policy
 from shepherd_phys.controllers.network import SectorNetwork, input_shape, without_scatter
-from shepherd_phys.controllers.policy_files import MAX_FRAMES, MAX_WEIGHTS
+from shepherd_phys.controllers.policy_files import MAX_FRAMES, MAX_WEIGHTS, Acting
 from shepherd_phys.envs.mixture import Mixture
 from shepherd_phys.envs.rewards import SCHEMES, Effort, Gathered, Occlusion, Term
 from shepherd_phys.lidar import CHANNELS, Lidar
@@ -143,7 +143,7 @@ class Preset(Settings):
     mean, each for as long as a decision while learning; see `shepherd_phys.controllers.policy_files.Acting`."""
     credit: Literal["own", "team"] = "own"
     """Who is paid for a term that has shares: each shepherd by its own, or all by the mean."""
-    decision_interval: int = Field(default=5, ge=1, le=1_000_000)
+    decision_interval: int = Field(default=5, ge=1, le=1000)
     """Control steps for which a decision is held while learning."""
     budget: int = Field(default=6_000_000, ge=1, le=10**15)
     """Shepherd-steps of the run, which ends with a whole checkpoint interval; see `n_rollouts`."""
@@ -199,6 +199,7 @@ class Preset(Settings):
         try:
             shapes = self.network.shapes(self.lidar)
             self.draw()
+            self.acting()  # what no policy file can say is refused before anything is learned
         except SettingsError as error:
             raise ValueError(str(error)) from None
         self._check_size(4 * sum(math.prod(shape) for shape in shapes.values()))
@@ -286,6 +287,10 @@ class Preset(Settings):
         if self.gathered:
             scheme["gathered"] = (self.gathered, Gathered())
         return scheme
+
+    def acting(self) -> Acting:
+        """How its policy acts when it is deployed."""
+        return Acting(frame=self.lidar.frame, rest=self.rest, noise=self.noise, noise_steps=self.decision_interval)
 
     def start(self) -> Policy | None:
         """The policy to start from, if there is one.
