@@ -131,6 +131,13 @@ def test_only_a_model_of_the_right_sizes_becomes_a_policy():
         load_actor(policy_of(LIDAR, SMALL), {name: array for name, array in weights.items() if name != "log_std"})
 
 
+def test_state_dependent_exploration_is_refused():
+    env = TeamVecEnv(TINY.scenario, (1,), lidar=LIDAR)
+    with pytest.raises(SettingsError, match=r"^use_sde: .*given: True"):
+        PPO(TeamPolicy, env, use_sde=True, n_steps=4, batch_size=4, policy_kwargs={"network": SMALL})
+    env.close()
+
+
 def test_a_model_whose_weights_have_other_names_is_refused(monkeypatch):
     policy = policy_of(LIDAR, SMALL)
     weights = actor_weights(policy)

@@ -12,6 +12,7 @@ from torch import nn
 
 from shepherd_phys.controllers.network import SectorNetwork
 from shepherd_phys.learning.preset import CriticNetwork
+from shepherd_phys.settings import SettingsError
 
 
 class SectorFeatures(BaseFeaturesExtractor):
@@ -67,6 +68,9 @@ class TeamPolicy(MultiInputActorCriticPolicy):
         network: sizes of the actor.
         critic: sizes of the critic; of both, none given: the default ones.
         options: further ones of stable-baselines3's policies, such as ``log_std_init``.
+
+    Raises:
+        SettingsError: ``use_sde`` is asked for: its standard deviations are no two numbers, and no policy file's.
     """
 
     def __init__(
@@ -78,6 +82,8 @@ class TeamPolicy(MultiInputActorCriticPolicy):
         critic: CriticNetwork | None = None,
         **options: Any,
     ) -> None:
+        if options.get("use_sde"):
+            raise SettingsError("use_sde: a TeamPolicy explores without it (given: True)")
         self.network, self.critic = network or SectorNetwork(), critic or CriticNetwork()
         super().__init__(
             observation_space,
