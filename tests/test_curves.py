@@ -269,7 +269,7 @@ def test_figure_1_as_a_page():
     assert "| recipe | reward | seeds | final reward | levels off at | 1 flock | 2 flocks | rate | time |" in lines
     assert "| fast | wild | 2 | 10.00 | 15.00 | 98.0 | 95.0 | 10,000 | 1:06:40 |" in lines
     assert "| paper | any | 1 | 1.00 | not within 3.00 |  |  | 10,000 | 0:05:00 |" in lines
-    assert any("side by side" in line and "`paper`" in line for line in lines)
+    assert any("one process each" in line and "`paper`" in line for line in lines)
     assert "| 0 | 0.96 | 0:02:01 | 96.5 [95.0, 98.0] | not confirmed |" in lines
     assert "| 1 | not reached |  |  |  |" in lines
 

@@ -83,15 +83,15 @@ class PPOSettings(Settings):
     """Logarithm of the exploration's standard deviation at the start."""
     last_log_std: float | None = Field(default=None, ge=-5, le=1)
     """That logarithm may be no more than a line from ``log_std_init`` to this one, whatever is learned: a policy acts
-    without exploration when it is deployed, and must learn to get out of where only exploration got it out. None: no
-    such line."""
+    with little or none of it when it is deployed, and must learn to get out of where only exploration got it out. None:
+    no such line."""
     last_log_std_at: int = Field(default=4_000_000, ge=1, le=10**15)
     """Shepherd-steps at which the line reaches ``last_log_std``, where it stays."""
 
 
 @settings
 class Validation(Settings):
-    """How policies are judged during training: deterministic, deployed by numpy, on seeds of their own."""
+    """How policies are judged during training: as they are deployed, by numpy, on seeds of their own."""
 
     flocks: Counts = (1, 2, 5)
     """Numbers of flocks; every combination of the three lists is a point."""
