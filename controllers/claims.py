@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .curves import WINDOW, Curve, curve_of, later_by
+from .curves import WINDOW, Curve, curve_of, later_by, levels_off_at
 from .summary import correlation, intervals
 
 Floats = NDArray[np.float64]
@@ -93,9 +93,7 @@ class Side:
         return UNDECIDED
 
     def _holds(self, number: float) -> bool:
-        if self.strict:  # an end at infinity is no end
-            return (self.least < number or self.least == -math.inf) and (number < self.most or self.most == math.inf)
-        return self.least <= number <= self.most
+        return self.least < number < self.most if self.strict else self.least <= number <= self.most
 
     def __str__(self) -> str:
         if math.isinf(self.most):
@@ -120,8 +118,6 @@ class Part:
     counts: bool = True
     """Whether the claim is about it; otherwise it is reported beside."""
     note: str = ""
-    bound: str = ""
-    """"≥" or "≤" where the value is a bound of the number, of which more is not known."""
     recipe: str | None = None
     """Of the training that it is about, where it is about training."""
     budget: float | None = None
@@ -151,7 +147,6 @@ class Part:
             "verdict": self.verdict,
             "counts": self.counts,
             "note": self.note,
-            "bound": self.bound,
             "recipe": self.recipe,
             "budget": self.budget,
         }
@@ -305,8 +300,8 @@ def _follows_n(trials: Trials, metric: str, side: Side) -> Iterator[Part]:
 def _levels_off_before(trials: Trials, first: str, then: str) -> Iterator[Part]:
     """c8: difference of the shepherd-steps at which two schemes level off, bootstrapped over seeds.
 
-    Both curves end with the same rollout: where one levels off depends on its length. One that does not level off by
-    then has a bound: the other one was earlier, or, if neither has, nobody knows.
+    Both curves end with the same rollout: where one levels off depends on its length. Where one does not by then,
+    nobody knows which is earlier.
     """
     ran = {row["recipe"] for row in trials.curves}
     for recipe in (RECIPE, *([PAPERS_RECIPE] if PAPERS_RECIPE in ran else [])):
@@ -327,14 +322,11 @@ def _later(part: Part, curve: Curve, other: Curve) -> Part:
     if min(len(own.steps) for own in (curve, other)) < WINDOW:
         return replace(part, note=f"fewer than {WINDOW} evaluations")
     part = replace(part, budget=float(max(own.steps[-1] for own in (curve, other))))
-    least, most, low, high = (steps / 1e6 for steps in later_by(curve, other))
-    if math.isfinite(least) and math.isfinite(most):
-        return replace(part, value=least, low=low, high=high)
-    if math.isfinite(least):
-        return replace(part, value=least, bound="≥", low=low, high=high, note=f"{part.method} does not level off")
-    if math.isfinite(most):
-        return replace(part, value=most, bound="≤", low=low, high=high, note=f"{part.rival} does not level off")
-    return replace(part, note="neither levels off")
+    later = later_by(curve, other)
+    if later.value is None:
+        late = [method for method, own in ((part.method, curve), (part.rival, other)) if levels_off_at(own) is None]
+        return replace(part, note="neither levels off" if len(late) == 2 else f"{late[0]} does not level off")
+    return replace(part, value=later.value / 1e6, low=later.low / 1e6, high=later.high / 1e6)
 
 
 def _learned(trials: Trials) -> list[tuple[str, bool]]:

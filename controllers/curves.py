@@ -6,7 +6,8 @@ range from its final value.
 
 Every curve comes within that band of its own last value in the end, even one that rises to its end. So a curve that
 does so only in its **tail**, the last `TAIL` of its shepherd-steps and at least the last `WINDOW` evaluations, has
-**not levelled off**. When a longer run would have is not known, but that it would not have before the tail.
+**not levelled off**. Where a longer run would have is not known, not even that it would not have before the tail:
+another final value may put that into the band, too.
 """
 
 from __future__ import annotations
@@ -99,29 +100,23 @@ def level_off(curves: Floats) -> NDArray[np.intp]:
     return np.asarray(np.where(outside.any(axis=1), last + 1, 0) + WINDOW - 1)
 
 
-def within(curve: Curve, at: NDArray[np.intp]) -> tuple[Floats, Floats]:
-    """Least and most shepherd-steps (m,) at which curves of these evaluations level off for good.
+def steps_at(curve: Curve, at: NDArray[np.intp]) -> Floats:
+    """(m,) shepherd-steps at which curves level off; infinity where that lies in the tail.
 
     Args:
         curve: of at least `WINDOW` evaluations.
         at: (m,) what `level_off` says of curves at its evaluations, resampled ones perhaps.
-
-    Returns:
-        both the shepherd-steps of that evaluation; where that lies in the tail, those where the tail begins, and
-        infinity.
     """
     tail = min((1.0 - TAIL) * curve.steps[-1], curve.steps[-WINDOW])
     found = curve.steps[at]
-    return np.minimum(found, tail), np.where(found < tail, found, math.inf)
+    return np.where(found < tail, found, math.inf)
 
 
 class Later(NamedTuple):
     """Shepherd-steps by which one curve levels off later than another."""
 
-    least: float
-    """Of the curves as they are; -inf where the other one has not levelled off."""
-    most: float
-    """inf where the one has not."""
+    value: float | None
+    """Of the curves as they are; None where one of them has not levelled off."""
     low: float
     """Low end of the 95 % bootstrap percentile interval."""
     high: float
@@ -131,8 +126,8 @@ def later_by(curve: Curve, other: Curve) -> Later:
     """Shepherd-steps by which a curve levels off later than another, with a 95 % bootstrap percentile interval.
 
     Seeds are resampled, those of the two curves independently: runs of equal seed have nothing in common but worlds
-    that they soon lead elsewhere. What has not levelled off has a bound and no number, in each resample, too: the low
-    end of the interval is of the least that each resample can mean, the high end of the most.
+    that they soon lead elsewhere. Of a resample in which a curve has not levelled off nothing is known: it counts as
+    -infinity for the low end of the interval and as infinity for the high one.
 
     Args:
         curve: of at least one seed and `WINDOW` evaluations.
@@ -146,22 +141,22 @@ def later_by(curve: Curve, other: Curve) -> Later:
         for k in range(len(own.seeds)):
             means += own.values[chosen[:, k]]
         means /= len(own.seeds)
-        ends.append(within(own, level_off(np.vstack([own.values.mean(axis=0)[None], means]))))
-    (least, most), (others_least, others_most) = ends
-    least, most = least - others_most, most - others_least
+        ends.append(steps_at(own, level_off(np.vstack([own.values.mean(axis=0)[None], means]))))
+    known = np.isfinite(ends[0]) & np.isfinite(ends[1])
+    later = np.subtract(ends[0], ends[1], out=np.zeros(len(known)), where=known)
     tail = 50.0 * (1.0 - LEVEL)
     # no interpolation: between a number and infinity there is nothing
-    low = np.percentile(least[1:], tail, method="lower")
-    high = np.percentile(most[1:], 100.0 - tail, method="higher")
-    return Later(float(least[0]), float(most[0]), float(low), float(high))
+    low = np.percentile(np.where(known, later, -math.inf)[1:], tail, method="lower")
+    high = np.percentile(np.where(known, later, math.inf)[1:], 100.0 - tail, method="higher")
+    return Later(float(later[0]) if known[0] else None, float(low), float(high))
 
 
 def levels_off_at(curve: Curve) -> float | None:
     """Shepherd-steps at which the mean over seeds levels off; None: not within its length."""
     if len(curve.steps) < WINDOW:
         return None
-    least, most = within(curve, level_off(curve.values.mean(axis=0)[None]))
-    return float(least[0]) if math.isfinite(most[0]) else None
+    (steps,) = steps_at(curve, level_off(curve.values.mean(axis=0)[None]))
+    return float(steps) if math.isfinite(steps) else None
 
 
 def final_value(curve: Curve) -> float | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -27,7 +28,7 @@ class SectorNetwork(Settings):
         hidden:   relu(W_2 [all groups] + b_2)
         latent:   tanh(W_3 . + b_3)
         action:   W_4 . + b_4, the mean of the action's distribution
-        its standard deviations:  exp(log_std), with ``scatter`` exp(log_std + 1.5 tanh(W_5 latent))
+        its standard deviations:  exp(log_std)
 
     All groups use the same W_1, as a convolution does, and beams wrap around: the neighbours of the first group are the
     last one's columns. There is no normalisation of any input.
@@ -43,9 +44,6 @@ class SectorNetwork(Settings):
     """Width of the layer over all groups."""
     latent: int = Field(default=64, ge=1, le=4096)
     """Width of the last layer before the action."""
-    scatter: bool = False
-    """Whether how widely actions scatter depends on what is seen: a shepherd that does not know what its fellows will
-    do may try something, and one whose work is done need not."""
 
     def shapes(self, lidar: Lidar) -> dict[str, tuple[int, ...]]:
         """Shape of each weight by name, for observations of these lidar settings.
@@ -75,15 +73,16 @@ class SectorNetwork(Settings):
             "action.weight": (2, self.latent),
             "action.bias": (2,),
             "log_std": (2,),
-            **({"scatter.weight": (2, self.latent)} if self.scatter else {}),
         }
 
 
-SCATTER = 1.5
-"""How far what is seen may move the logarithm of a standard deviation, up or down."""
-
 ARCHITECTURES: dict[str, type[SectorNetwork]] = {"SectorNetwork": SectorNetwork}
 """By name, for policy files."""
+
+
+def without_scatter(table: Mapping[str, Any]) -> dict[str, Any]:
+    """A network's fields without ``scatter``: the policies and runs of earlier versions say that it is false."""
+    return {name: value for name, value in table.items() if name != "scatter" or value is not False}
 
 
 def input_shape(lidar: Lidar) -> tuple[int, int]:
@@ -117,11 +116,6 @@ class Actor:
             for array in (np.array(weights[f"{name}.weight"].T, order="C"), np.array(weights[f"{name}.bias"]))
         ]
         self._log_std = np.array(weights["log_std"])
-        self._scatter = "scatter.weight" in weights
-        if self._scatter:  # two more outputs of the last layer
-            *_, action, bias = self._layers
-            self._layers[-2] = np.concatenate((action, weights["scatter.weight"].T), axis=1)
-            self._layers[-1] = np.concatenate((bias, np.zeros(2, np.float32)))
 
     def __call__(self, observation: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Means and standard deviations (P, 2), not clipped, of the actions for P observations (P, R, C) float32."""
@@ -132,8 +126,6 @@ class Actor:
         outputs: NDArray[np.float32] = _forward(
             np.ascontiguousarray(observation, np.float32), self._group, self._overlap, *self._layers
         )
-        if self._scatter:
-            return outputs[:, :2], np.exp(self._log_std + SCATTER * np.tanh(outputs[:, 2:]), dtype=np.float32)
         return outputs, np.exp(np.broadcast_to(self._log_std, outputs.shape))
 
 

@@ -27,7 +27,7 @@ from shepherd_phys.lidar import Lidar
 from shepherd_phys.scenario import Scenario
 from shepherd_phys.settings import Settings, SettingsError, settings, tagged, untagged
 
-from .network import ARCHITECTURES, SectorNetwork
+from .network import ARCHITECTURES, SectorNetwork, without_scatter
 
 FORMAT = "shepherd_phys policy"
 FORMAT_VERSION = 1
@@ -185,7 +185,7 @@ def _spec(table: Mapping[str, Any], classes: Iterable[Any]) -> PolicySpec:
 
 
 def _network(table: Mapping[str, Any]) -> SectorNetwork:
-    network = untagged(table, ARCHITECTURES, "network")
+    network = untagged(without_scatter(table), ARCHITECTURES, "network")
     if not isinstance(network, SectorNetwork):  # module:Name
         raise PolicyError(f"network.kind: {_brief(repr(table['kind']))} is unknown; known: {', '.join(ARCHITECTURES)}")
     return network

@@ -66,7 +66,7 @@ def _whole(run: Run, place: Path) -> bool:
         raise SettingsError(f"{error}; another --out begins anew") from None
     except CheckpointError as error:
         raise SettingsError(str(error)) from None
-    return saved is not None and ended(saved, run.preset, 3600.0 * run.hours) and exported(place, saved)
+    return saved is not None and ended(saved, run.preset.n_rollouts, 3600.0 * run.hours) and exported(place, saved)
 
 
 def one_by_one(runs: Sequence[Run], folder: Path, workers: int) -> list[Failed]:

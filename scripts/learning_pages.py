@@ -39,9 +39,9 @@ def figure1_page(curves: Sequence[Row], validations: Sequence[Row], home: Sequen
         "second and wall-clock time of training, validations left out.",
         "",
         "The runs whose time to home is told below were trained one at a time, with all worker processes; rate and "
-        "time of `fast` with `wild` are of these alone. All the others were trained side by side, as many as there "
-        "were workers, each with one process: the one of the preset `paper`, too, whose training was limited to a "
-        "time, not to a number of steps.",
+        "time of `fast` with `wild` are of these alone. All the others had one process each, as many of them at a "
+        "time as there were workers: the one of the preset `paper`, too, whose training was limited to a time, not "
+        "to a number of steps.",
         "",
         line(head),
         line(["---", "---", *["---:"] * (len(head) - 2)]),

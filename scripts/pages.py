@@ -125,11 +125,10 @@ def part_cells(part: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _known(part: Mapping[str, Any], digits: str) -> str:
-    """The number of a part, or the bound of one and why there is no more; ends of its interval may be at infinity."""
+    """The number of a part; ends of its interval may be at infinity."""
     low = "-∞" if part["low"] is None else f"{part['low']:{digits}}"
     high = "∞" if part["high"] is None else f"{part['high']:{digits}}"
-    known = f"{part['value']:{digits}} [{low}, {high}]"
-    return f"{part['bound']} {known}: {part['note']}" if part.get("bound") else known
+    return f"{part['value']:{digits}} [{low}, {high}]"
 
 
 def _interval(row: Mapping[str, Any], value: str, prefix: str, digits: str) -> str:

@@ -159,18 +159,17 @@ def test_a_decision_is_held_for_its_interval():
     assert same == [True, True, False, True, True]
 
 
-@pytest.mark.parametrize("scatter", [False, True])
-def test_chance_is_drawn_anew_after_its_time_in_proportion_to_the_deviation_and_from_the_seed(scatter):
-    lidar, network = Lidar(beams=16, stack=1), SMALL.but(scatter=scatter)
-    weights = random_weights(network, lidar)
+def test_chance_is_drawn_anew_after_its_time_in_proportion_to_the_deviation_and_from_the_seed():
+    lidar = Lidar(beams=16, stack=1)
+    weights = random_weights(SMALL, lidar)
     weights["log_std"][:] = (-2.0, -1.0)
     for name in ("action.weight", "action.bias"):
         weights[name] *= 0.1
     seen = np.random.default_rng(1).random((5, 3, 16), dtype=np.float32)
-    mean, deviation = Actor(network, lidar, weights)(seen)
+    mean, deviation = Actor(SMALL, lidar, weights)(seen)
 
     def acts(noise, seed, n_steps=7):
-        policy = Policy(spec_of(lidar, network, noise=noise, noise_steps=3), weights)
+        policy = Policy(spec_of(lidar, noise=noise, noise_steps=3), weights)
         policy.reset(np.random.default_rng(seed))
         return np.array([policy.act(seen, STATE.but(step=k)) for k in range(n_steps)])
 
@@ -385,6 +384,7 @@ HOSTILE_FIELDS = {
     "huge layers": {"network": {"kind": "SectorNetwork", "hidden": 10**12}},
     "large layers": {"network": {"kind": "SectorNetwork", "features": 4096, "hidden": 4096, "latent": 4096}},
     "a group that does not divide": {"network": {"kind": "SectorNetwork", "group": 3}},
+    "actions that scatter by what is seen": {"network": {"kind": "SectorNetwork", "scatter": True}},
     "no group": {"network": {"kind": "SectorNetwork", "group": 0}},
     "more overlap than columns": {"network": {"kind": "SectorNetwork", "overlap": 60}},
     "another frame": {"action": {"frame": "world"}},
@@ -401,6 +401,14 @@ def test_hostile_fields_are_one_error(name, policy_path):
     table = json.loads(policy_path.read_text())
     resealed(policy_path, {**table, **HOSTILE_FIELDS[name]})
     refused(policy_path)
+
+
+def test_policies_of_earlier_versions_are_read(policy_path):
+    """They say that actions do not scatter by what is seen."""
+    table = json.loads(policy_path.read_text())
+    table["network"]["scatter"] = False
+    resealed(policy_path, table)
+    assert load_policy(policy_path).spec == spec_of()
 
 
 @pytest.mark.parametrize("name", FIELDS)

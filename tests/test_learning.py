@@ -59,7 +59,6 @@ CASES = {
     "fast": (Lidar(sectors=64, frame="goal"), SectorNetwork()),
     "fast, overlapping": (Lidar(sectors=64, frame="goal"), SectorNetwork(overlap=3)),
     "paper": (Lidar(), SectorNetwork(group=8)),
-    "scatter": (Lidar(sectors=64, frame="goal"), SectorNetwork(scatter=True)),
     "four channels": (Lidar(channels=("sheep", "shepherds", "goal", "obstacles"), sectors=64), SectorNetwork()),
 }
 
@@ -79,9 +78,8 @@ def test_torch_and_numpy_agree(name, tmp_path):
         wanted, deviation = wanted_of.mode().numpy(), wanted_of.distribution.stddev.numpy()
     assert np.abs(wanted).max() > 0.1
     exported = to_policy(policy, spec_of(lidar, network), tmp_path / "p.json")
-    acts, scatters = Actor(network, lidar, exported.weights)(observation)
-    assert acts == pytest.approx(wanted, abs=1e-5) and scatters == pytest.approx(deviation, abs=1e-5)
-    assert (np.ptp(scatters, axis=0) > 0.01).all() == network.scatter
+    means, deviations = Actor(network, lidar, exported.weights)(observation)
+    assert means == pytest.approx(wanted, abs=1e-5) and deviations == pytest.approx(deviation, abs=1e-5)
     back = to_sb3(load_policy(tmp_path / "p.json"), critic_numbers=7)
     action, _ = back.predict({"lidar": observation, "critic": np.zeros((50, 7), np.float32)}, deterministic=True)
     assert action == pytest.approx(np.clip(wanted, -1, 1), abs=1e-6)
@@ -126,19 +124,27 @@ def test_only_a_model_of_the_right_sizes_becomes_a_policy():
     env.close()
     with pytest.raises(PolicyError, match="of another size"):
         load_actor(policy_of(LIDAR, SMALL), random_weights(SMALL.but(hidden=9), LIDAR))
+    weights = random_weights(SMALL, LIDAR)
+    with pytest.raises(PolicyError, match=r"moon\.weight: is no weight of the network"):
+        load_actor(policy_of(LIDAR, SMALL), {**weights, "moon.weight": weights["log_std"]})
+    with pytest.raises(PolicyError, match="log_std: is missing"):
+        load_actor(policy_of(LIDAR, SMALL), {name: array for name, array in weights.items() if name != "log_std"})
 
 
-def test_a_policy_may_begin_to_scatter_by_what_it_sees():
-    policy = policy_of(LIDAR, SMALL.but(scatter=True))
-    assert set(actor_weights(policy)) == set(SMALL.but(scatter=True).shapes(LIDAR))
-    plain = random_weights(SMALL, LIDAR, seed=9)
-    load_actor(policy, plain)
-    observation = np.random.default_rng(0).random((4, 6, 16), dtype=np.float32)
-    with torch.no_grad():
-        deviation = policy.get_distribution({"lidar": torch.from_numpy(observation)}).distribution.stddev.numpy()
-    assert deviation == pytest.approx(np.tile(np.exp(plain["log_std"]), (4, 1)))  # until it has learned otherwise
-    with pytest.raises(PolicyError, match=r"scatter.weight|another size"):
-        load_actor(policy_of(LIDAR, SMALL.but(scatter=True, latent=9)), plain)
+def test_state_dependent_exploration_is_refused():
+    env = TeamVecEnv(TINY.scenario, (1,), lidar=LIDAR)
+    with pytest.raises(SettingsError, match=r"^use_sde: .*given: True"):
+        PPO(TeamPolicy, env, use_sde=True, n_steps=4, batch_size=4, policy_kwargs={"network": SMALL})
+    env.close()
+
+
+def test_a_model_whose_weights_have_other_names_is_refused(monkeypatch):
+    policy = policy_of(LIDAR, SMALL)
+    weights = actor_weights(policy)
+    for wrong in ({**weights, "moon.weight": weights["log_std"]}, {"log_std": weights["log_std"]}):
+        monkeypatch.setattr("shepherd_phys.learning.export.actor_weights", lambda _, wrong=wrong: wrong)
+        with pytest.raises(PolicyError, match="is no weight of the network|is missing"):
+            to_policy(policy, spec_of())
 
 
 def test_a_live_model_is_exported_and_goes_on(learner, tmp_path):
@@ -289,6 +295,9 @@ def test_presets_are_read_and_written(tmp_path):
     TINY.to_toml(tmp_path / "p.toml")
     assert load_preset(tmp_path / "p.toml") == TINY
     assert load_preset("fast").but(budget=1) == Preset(budget=1)
+    text = (tmp_path / "p.toml").read_text()
+    (tmp_path / "p.toml").write_text(text.replace("[network]\n", "[network]\nscatter = false\n"))  # earlier versions
+    assert "scatter" in (tmp_path / "p.toml").read_text() and load_preset(tmp_path / "p.toml") == TINY
 
 
 def test_the_papers_preset_is_the_papers():
@@ -321,6 +330,7 @@ def test_a_preset_may_mix_worlds_and_price_effort():
     [
         ("reward = 'wold'", "'wold' is not one of original, any, wild"),
         ("rewards = 'wild'", "rewards: there is no such field"),
+        ("decision_interval = 1001", "decision_interval.*less than or equal to 1000"),
         ("budget = 0", "budget.*greater than or equal to 1"),
         ("team_sizes = []", "team_sizes"),
         ("team_sizes = [0]", "team_sizes"),
@@ -406,3 +416,7 @@ def test_a_policy_that_was_trained_deploys_where_it_was_not(learner):
     assert isinstance(policy, Policy)
     rows = Validator(TINY.but(validation=Validation(flocks=(3,), shepherds=(1, 6), trials=1)))(policy)
     assert [row["n_shepherds"] for row in rows] == [1, 6]
+
+
+def test_the_longest_decision_can_be_exported():
+    assert spec_of_preset(TINY.but(decision_interval=1000)).action.noise_steps == 1000

@@ -253,6 +253,27 @@ def test_a_finished_run_is_not_trained_further(unbroken, tmp_path):
     assert after.facts == before.facts
 
 
+def test_a_smaller_budget_leaves_a_longer_run_as_it_is(unbroken, tmp_path, monkeypatch):
+    shutil.copytree(unbroken, tmp_path / "run")
+    names = [path.name for path in unbroken.iterdir() if path.suffix in {".csv", ".json", ".safetensors", ".toml"}]
+    monkeypatch.setattr("shepherd_phys.controllers.policy_files.__version__", "99")  # nor does a later version
+    train(tmp_path / "run", preset=PRESET.but(budget=240))
+    train(tmp_path / "run")
+    for name in names:
+        assert (tmp_path / "run" / name).read_bytes() == (unbroken / name).read_bytes(), name
+
+
+def test_a_run_that_ends_sooner_goes_on_as_the_longer_one(unbroken, tmp_path):
+    begin(tmp_path, PRESET)
+    seen = []
+    train(tmp_path, preset=PRESET.but(budget=240), report=seen.append)
+    assert len(rows_of(tmp_path / "curve.csv")) == 2 and {told.length for told in seen} == {240}
+    assert Preset.from_toml(tmp_path / "preset.toml") == PRESET
+    assert load_policy(tmp_path / "policy.json").spec.training["budget"] == PRESET.budget
+    train(tmp_path)
+    assert_same_run(tmp_path, unbroken)
+
+
 @pytest.mark.parametrize(("short", "every"), [(1, 1), (240, 1), (241, 1), (1, 2), (500, 2), (481, 4), (481, 3)])
 def test_a_run_that_is_made_longer_is_the_one_that_was_longer_from_the_start(short, every, tmp_path):
     """Whether or not the end of the shorter one was a validation's turn."""

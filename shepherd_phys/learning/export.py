@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from torch import nn
 
 from shepherd_phys.controllers.learned import Policy
 from shepherd_phys.controllers.network import input_shape
-from shepherd_phys.controllers.policy_files import Acting, PolicyError, PolicySpec, write_policy
+from shepherd_phys.controllers.policy_files import PolicyError, PolicySpec, write_policy
 from shepherd_phys.learning.network import SectorFeatures, TeamPolicy
 from shepherd_phys.learning.preset import CriticNetwork, Preset
 from shepherd_phys.settings import tagged
@@ -36,9 +37,7 @@ def spec_of(preset: Preset, shepherd_steps: int = 0) -> PolicySpec:
         scenario=preset.scenario,
         lidar=preset.lidar,
         network=preset.network,
-        action=Acting(
-            frame=preset.lidar.frame, rest=preset.rest, noise=preset.noise, noise_steps=preset.decision_interval
-        ),
+        action=preset.acting(),
         rewards=rewards,
         training={**training, "algorithm": "PPO of stable-baselines3", "shepherd_steps": shepherd_steps},
     )
@@ -50,16 +49,15 @@ def actor_weights(policy: TeamPolicy) -> dict[str, NDArray[np.float32]]:
 
 
 def load_actor(policy: TeamPolicy, weights: dict[str, NDArray[np.float32]]) -> None:
-    """Put a policy's weights into the actor, which may scatter by what it sees though the policy did not.
+    """Put a policy's weights into the actor.
 
     Raises:
-        PolicyError: the network has other sizes.
+        PolicyError: the network has other weights, or of other sizes.
     """
     actor = _actor(policy)
-    if "scatter.weight" in actor and "scatter.weight" not in weights:
-        weights = {**weights, "scatter.weight": np.zeros(tuple(actor["scatter.weight"].shape), np.float32)}
+    _check_names(actor, weights)
     for name, parameter in actor.items():
-        if name not in weights or tuple(parameter.shape) != weights[name].shape:
+        if tuple(parameter.shape) != weights[name].shape:
             raise PolicyError(f"{name}: the network needs {tuple(parameter.shape)}; the policy's is of another size")
     with torch.no_grad():
         for name, parameter in actor.items():
@@ -81,7 +79,9 @@ def to_policy(model: BaseAlgorithm | TeamPolicy, spec: PolicySpec, path: str | P
     if not isinstance(policy, TeamPolicy):
         raise PolicyError(f"only a TeamPolicy can become a policy file (given: {type(policy).__name__})")
     weights = actor_weights(policy)
-    for name, shape in spec.network.shapes(spec.lidar).items():
+    shapes = spec.network.shapes(spec.lidar)
+    _check_names(shapes, weights)
+    for name, shape in shapes.items():
         if weights[name].shape != shape:
             raise PolicyError(f"{name}: the spec tells {shape}, the model has {weights[name].shape}")
     checksum = write_policy(path, spec, weights) if path is not None else ""
@@ -125,6 +125,10 @@ def _actor(policy: TeamPolicy) -> dict[str, nn.Parameter]:
     }
     named = {f"{name}.{part}": getattr(layer, part) for name, layer in layers.items() for part in ("weight", "bias")}
     named["log_std"] = policy.log_std
-    if policy.scatter is not None:
-        named["scatter.weight"] = policy.scatter.weight
     return named
+
+
+def _check_names(wanted: Collection[str], given: Collection[str]) -> None:
+    """Refuse other weights than those wanted."""
+    for name in sorted(set(wanted) ^ set(given)):
+        raise PolicyError(f"{name}: {'is missing' if name in wanted else 'is no weight of the network'}")

@@ -99,17 +99,18 @@ def alone(folder: Path) -> Iterator[None]:
         lock.close()
 
 
-def ended(saved: Checkpoint, preset: Preset, seconds: float = math.inf) -> bool:
-    """Whether a run needs no further training: all its rollouts are done, or so many seconds of it."""
-    return bool(saved.facts["rollouts"] >= preset.n_rollouts or saved.facts["seconds"] >= seconds)
+def ended(saved: Checkpoint, n_rollouts: int, seconds: float = math.inf) -> bool:
+    """Whether a run needs no further training: so many rollouts are done, or so many seconds of it."""
+    return bool(saved.facts["rollouts"] >= n_rollouts or saved.facts["seconds"] >= seconds)
 
 
-def is_policy_of(path: Path, shepherd_steps: int) -> bool:
-    """Whether a whole policy lies there that had trained for so long: a kill may have come before, or in the middle."""
+def is_policy_of(path: Path, **training: int) -> bool:
+    """Whether a whole policy lies there that was trained so: a kill may have come before, or in the middle."""
     try:
-        return bool(load_policy(path).spec.training.get("shepherd_steps") == shepherd_steps)
+        told = load_policy(path).spec.training
     except PolicyError:
         return False
+    return all(told.get(name) == value for name, value in training.items())
 
 
 def exported(folder: Path, saved: Checkpoint) -> bool:
@@ -118,7 +119,7 @@ def exported(folder: Path, saved: Checkpoint) -> bool:
     for file in (BEST, FIRST):
         if Path(file).stem in saved.facts:
             wanted[file] = saved.facts[Path(file).stem]["shepherd_steps"]
-    return all(is_policy_of(folder / file, steps) for file, steps in wanted.items())
+    return all(is_policy_of(folder / file, shepherd_steps=steps) for file, steps in wanted.items())
 
 
 class Table:

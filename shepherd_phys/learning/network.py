@@ -6,13 +6,13 @@ from typing import Any
 
 import torch
 from gymnasium import spaces
-from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution
 from stable_baselines3.common.policies import MultiInputActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, MlpExtractor
 from torch import nn
 
-from shepherd_phys.controllers.network import SCATTER, SectorNetwork
+from shepherd_phys.controllers.network import SectorNetwork
 from shepherd_phys.learning.preset import CriticNetwork
+from shepherd_phys.settings import SettingsError
 
 
 class SectorFeatures(BaseFeaturesExtractor):
@@ -68,6 +68,9 @@ class TeamPolicy(MultiInputActorCriticPolicy):
         network: sizes of the actor.
         critic: sizes of the critic; of both, none given: the default ones.
         options: further ones of stable-baselines3's policies, such as ``log_std_init``.
+
+    Raises:
+        SettingsError: ``use_sde`` is asked for: its standard deviations are no two numbers, and no policy file's.
     """
 
     def __init__(
@@ -79,6 +82,8 @@ class TeamPolicy(MultiInputActorCriticPolicy):
         critic: CriticNetwork | None = None,
         **options: Any,
     ) -> None:
+        if options.get("use_sde"):
+            raise SettingsError("use_sde: a TeamPolicy explores without it (given: True)")
         self.network, self.critic = network or SectorNetwork(), critic or CriticNetwork()
         super().__init__(
             observation_space,
@@ -112,15 +117,3 @@ class TeamPolicy(MultiInputActorCriticPolicy):
         heads.value_net = nn.Sequential(nn.Linear(self.critic.hidden, self.critic.latent), nn.Tanh()).to(self.device)
         heads.latent_dim_vf = self.critic.latent
         self.mlp_extractor = heads
-        self.scatter: nn.Linear | None = None
-        if self.network.scatter:
-            self.scatter = nn.Linear(self.network.latent, 2, bias=False)
-            nn.init.zeros_(self.scatter.weight)  # at first it is the same everywhere
-
-    def _get_action_dist_from_latent(self, latent_pi: torch.Tensor) -> Distribution:
-        """The actions' distribution; see `SectorNetwork`."""
-        log_std: torch.Tensor = self.log_std
-        if self.scatter is not None:
-            log_std = log_std + SCATTER * torch.tanh(self.scatter(latent_pi))
-        assert isinstance(self.action_dist, DiagGaussianDistribution)
-        return self.action_dist.proba_distribution(self.action_net(latent_pi), log_std)

@@ -10,8 +10,8 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BeforeValidator, Field
 
 from shepherd_phys.controllers.learned import POLICIES, Policy, load_policy
-from shepherd_phys.controllers.network import SectorNetwork, input_shape
-from shepherd_phys.controllers.policy_files import MAX_FRAMES, MAX_WEIGHTS
+from shepherd_phys.controllers.network import SectorNetwork, input_shape, without_scatter
+from shepherd_phys.controllers.policy_files import MAX_FRAMES, MAX_WEIGHTS, Acting
 from shepherd_phys.envs.mixture import Mixture
 from shepherd_phys.envs.rewards import SCHEMES, Effort, Gathered, Occlusion, Term
 from shepherd_phys.lidar import CHANNELS, Lidar
@@ -83,15 +83,15 @@ class PPOSettings(Settings):
     """Logarithm of the exploration's standard deviation at the start."""
     last_log_std: float | None = Field(default=None, ge=-5, le=1)
     """That logarithm may be no more than a line from ``log_std_init`` to this one, whatever is learned: a policy acts
-    without exploration when it is deployed, and must learn to get out of where only exploration got it out. None: no
-    such line."""
+    with little or none of it when it is deployed, and must learn to get out of where only exploration got it out. None:
+    no such line."""
     last_log_std_at: int = Field(default=4_000_000, ge=1, le=10**15)
     """Shepherd-steps at which the line reaches ``last_log_std``, where it stays."""
 
 
 @settings
 class Validation(Settings):
-    """How policies are judged during training: deterministic, deployed by numpy, on seeds of their own."""
+    """How policies are judged during training: as they are deployed, by numpy, on seeds of their own."""
 
     flocks: Counts = (1, 2, 5)
     """Numbers of flocks; every combination of the three lists is a point."""
@@ -143,7 +143,7 @@ class Preset(Settings):
     mean, each for as long as a decision while learning; see `shepherd_phys.controllers.policy_files.Acting`."""
     credit: Literal["own", "team"] = "own"
     """Who is paid for a term that has shares: each shepherd by its own, or all by the mean."""
-    decision_interval: int = Field(default=5, ge=1, le=1_000_000)
+    decision_interval: int = Field(default=5, ge=1, le=1000)
     """Control steps for which a decision is held while learning."""
     budget: int = Field(default=6_000_000, ge=1, le=10**15)
     """Shepherd-steps of the run, which ends with a whole checkpoint interval; see `n_rollouts`."""
@@ -199,6 +199,7 @@ class Preset(Settings):
         try:
             shapes = self.network.shapes(self.lidar)
             self.draw()
+            self.acting()  # what no policy file can say is refused before anything is learned
         except SettingsError as error:
             raise ValueError(str(error)) from None
         self._check_size(4 * sum(math.prod(shape) for shape in shapes.values()))
@@ -287,6 +288,10 @@ class Preset(Settings):
             scheme["gathered"] = (self.gathered, Gathered())
         return scheme
 
+    def acting(self) -> Acting:
+        """How its policy acts when it is deployed."""
+        return Acting(frame=self.lidar.frame, rest=self.rest, noise=self.noise, noise_steps=self.decision_interval)
+
     def start(self) -> Policy | None:
         """The policy to start from, if there is one.
 
@@ -301,8 +306,6 @@ class Preset(Settings):
         policy = POLICIES[name]() if name in POLICIES else load_policy(name)
         for part in ("lidar", "network"):
             theirs, ours = getattr(policy.spec, part), getattr(self, part)
-            if part == "network" and not policy.spec.network.scatter:
-                ours = ours.but(scatter=False)  # it can begin to
             if theirs != ours:
                 raise SettingsError(f"init: {name} has another {part} than the preset: {theirs}, not {ours}")
         return policy
@@ -344,7 +347,7 @@ class Preset(Settings):
 PARTS: dict[str, Callable[[Mapping[str, Any]], Any]] = {
     "scenario": Scenario.from_dict,
     "lidar": lambda table: Lidar(**table),
-    "network": lambda table: SectorNetwork(**table),
+    "network": lambda table: SectorNetwork(**without_scatter(table)),
     "critic": lambda table: CriticNetwork(**table),
     "ppo": lambda table: PPOSettings(**table),
     "validation": lambda table: Validation(**table),

@@ -17,7 +17,7 @@ from torch.utils.tensorboard import SummaryWriter
 from shepherd_phys.controllers.policy_files import write_policy
 from shepherd_phys.learning import checkpoints
 from shepherd_phys.learning.checkpoints import Checkpoint, CheckpointError
-from shepherd_phys.learning.export import spec_of, to_policy
+from shepherd_phys.learning.export import actor_weights, spec_of, to_policy
 from shepherd_phys.learning.folder import (
     BEST,
     CHECKPOINTS,
@@ -84,7 +84,8 @@ def train(
             on it.
         report: called after each rollout and each validation.
         seconds: of training, as in the curve: the run ends with the first checkpoint that reaches them, too.
-        preset: the run from now on, which may differ from the folder's in its budget alone; None: as it was.
+        preset: the run from now on, which may differ from the folder's in its budget alone; None: as it was. With a
+            smaller budget training ends sooner, and the run stays the longer one that it is.
 
     Returns:
         the best policy.
@@ -97,9 +98,11 @@ def train(
     """
     with alone(folder):
         kept = Preset.from_toml(folder / PRESET) if preset is None else agree(folder, preset)
-        preset = preset or kept
+        n_rollouts = (preset or kept).n_rollouts
+        if preset is None or preset.budget < kept.budget:
+            preset = kept
         newest = saved = checkpoints.load_latest(folder / CHECKPOINTS)
-        if newest is not None and not ended(newest, preset, seconds):
+        if newest is not None and not ended(newest, n_rollouts, seconds):
             saved = _gone_on_from(newest, preset, folder / CHECKPOINTS)
         decisions = 0 if saved is None else int(saved.facts["decisions"])
         logger = Logger(str(folder / TENSORBOARD), [_TensorBoard(folder / TENSORBOARD, decisions)])
@@ -111,7 +114,7 @@ def train(
                     preset.to_toml(folder / PRESET)
                 if newest is not None and saved is not newest:
                     _forget(folder, newest, saved)
-                run = _Run(folder, learner, validate, report, saved, seconds)
+                run = _Run(folder, learner, validate, report, saved, n_rollouts, seconds)
                 while not run.over:
                     run.interval()
                     if run.over or run.number % preset.validation.every == 0:
@@ -190,10 +193,11 @@ class _Run:
         validate: Validator,
         report: Callable[[Progress], None],
         saved: Checkpoint | None,
+        n_rollouts: int,
         limit: float,
     ) -> None:
         self._folder, self._learner, self._validate, self._report = folder, learner, validate, report
-        self._limit = limit
+        self._n_rollouts, self._limit = n_rollouts, limit
         self._out_of_turn = False
         self.number = 0
         self.chosen: dict[str, Chosen] = {}
@@ -207,7 +211,7 @@ class _Run:
         self._validations = Table(folder / VALIDATION, VALIDATION_COLUMNS, self.number)
         self._clock, self._seconds = _Clock(seconds, learner.shepherd_steps), seconds
         self._measures: dict[str, float] = {}
-        self.over = saved is not None and ended(saved, learner.preset, limit)
+        self.over = saved is not None and ended(saved, n_rollouts, limit)
         """Whether all rollouts are done, or the time is up. It changes with an interval only."""
 
     def interval(self) -> None:
@@ -235,7 +239,7 @@ class _Run:
             self._tell(())
         self.number += 1
         self._seconds = self._clock.seconds()
-        self.over = learner.rollouts >= learner.preset.n_rollouts or self._seconds >= self._limit
+        self.over = learner.rollouts >= self._n_rollouts or self._seconds >= self._limit
 
     def judge(self) -> None:
         """Validate the policy; keep it if it is the best so far, or the first that passes."""
@@ -270,18 +274,21 @@ class _Run:
         self._export()
 
     def _export(self) -> None:
-        """Write the latest policy and those that were picked."""
+        """Write the latest policy and those that were picked, where they do not lie there already."""
         learner = self._learner
-        to_policy(learner.model, spec_of(learner.preset, learner.shepherd_steps), self._folder / POLICY)
-        for file, kept in self.chosen.items():
-            if file == FIRST and is_policy_of(self._folder / file, kept.shepherd_steps):
-                continue  # with the budget of its day: its trials are known by its checksum
-            write_policy(self._folder / file, spec_of(learner.preset, kept.shepherd_steps), kept.weights)
+        weights = actor_weights(learner.policy)
+        policies = {POLICY: (learner.shepherd_steps, weights)}
+        policies |= {file: (kept.shepherd_steps, kept.weights) for file, kept in self.chosen.items()}
+        for file, (steps, own) in policies.items():
+            # the first keeps the budget of its day: its trials are known by its checksum
+            same = {} if file == FIRST else {"budget": learner.preset.budget}
+            if not is_policy_of(self._folder / file, shepherd_steps=steps, **same):
+                write_policy(self._folder / file, spec_of(learner.preset, steps), own)
 
     def _tell(self, validation: Sequence[Mapping[str, Any]]) -> None:
         steps = self._learner.shepherd_steps
         rate = self._clock.rate(steps)
-        length = self._learner.preset.n_rollouts * self._learner.preset.rollout_steps
+        length = self._n_rollouts * self._learner.preset.rollout_steps
         self._report(Progress(steps, length, rate, self._measures, validation))
 
 
