@@ -123,8 +123,7 @@ def ablations_page(curves: Sequence[Row], validations: Sequence[Row]) -> str:
         "Made by `shepherd-phys reproduce`. Of each variant, over its seeds: sheep in the goal at the end of "
         "validation episodes after training, %, mean (least to most); the mean reward of training episodes over the "
         f"last {WINDOW} evaluations (rollouts); M shepherd-steps when training episodes first ended with half of the "
-        "sheep in; shepherd-steps a second of one process, as many runs at a time as there were "
-        "workers.",
+        "sheep in; shepherd-steps a second of one process, as many runs at a time as there were workers.",
         "",
         line(head),
         line(["---", *["---:"] * (len(head) - 1)]),
