@@ -186,6 +186,8 @@ def test_chance_is_drawn_anew_after_its_time_in_proportion_to_the_deviation_and_
 def test_chance_rest_interval_and_the_goals_frame_go_together():
     weights = random_weights(SMALL, LIDAR)
     weights["log_std"][:] = (-1.0, -0.5)
+    for name in ("action.weight", "action.bias"):
+        weights[name] *= 0.4
     policy = Policy(spec_of(noise=0.5, noise_steps=3, rest=0.4, interval=2), weights)
     env = ShepherdingEnv("small", rewards={}, lidar=policy.lidar)
     reference = ShepherdingEnv("small", rewards={}, lidar=LIDAR)  # rolls by itself
