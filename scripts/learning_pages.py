@@ -46,10 +46,11 @@ def figure1_page(curves: Sequence[Row], validations: Sequence[Row], home: Sequen
         line(head),
         line(["---", "---", *["---:"] * (len(head) - 2)]),
     ]
+    timed = {row["seed"] for row in home}
     for recipe, reward in _schemes(curves):
         curve = curve_of(curves, recipe, reward)
         lasts = _lasts(curves, recipe, reward)
-        alone = [row for row in lasts if (recipe, reward) == TIMED and row["seed"] in {row["seed"] for row in home}]
+        alone = [row for row in lasts if (recipe, reward) == TIMED and row["seed"] in timed]
         paced = alone or lasts
         off = levels_off_at(curve)
         at_end = _at_end(validations, recipe, reward)
@@ -122,7 +123,7 @@ def ablations_page(curves: Sequence[Row], validations: Sequence[Row]) -> str:
         "Made by `shepherd-phys reproduce`. Of each variant, over its seeds: sheep in the goal at the end of "
         "validation episodes after training, %, mean (least to most); the mean reward of training episodes over the "
         f"last {WINDOW} evaluations (rollouts); M shepherd-steps when training episodes first ended with half of the "
-        "sheep in; shepherd-steps a second of one process, other runs beside it.",
+        "sheep in; shepherd-steps a second of one process, as many runs at a time as there were workers.",
         "",
         line(head),
         line(["---", *["---:"] * (len(head) - 1)]),

@@ -140,7 +140,7 @@ def progress_bar() -> Iterator[Any]:
             console.print(validation_of(now), soft_wrap=True)
             return
         told = pace_of(now)
-        bar.update(shown, total=now.length, completed=now.shepherd_steps, told=told)
+        bar.update(shown, total=1.0, completed=now.done, told=told)
         if not console.is_terminal and time.monotonic() - logged > LOG_SECONDS:
             logged = time.monotonic()
             print(f"{now.shepherd_steps:,} shepherd-steps: {told}", file=sys.stderr, flush=True)
@@ -151,7 +151,7 @@ def progress_bar() -> Iterator[Any]:
 
 def pace_of(now: Any) -> str:
     """What a run reports of a rollout, in words; pace and time left are of training, without validations."""
-    left = clock(max(0, now.length - now.shepherd_steps) / max(now.rate, 1e-9))
+    left = clock(max(0.0, 1.0 - now.done) * now.length / max(now.rate, 1e-9))
     told = f"{now.rate:,.0f} shepherd-steps/s, {left} of training left"
     if math.isfinite(now.measures["episode_reward"]):
         told += f", reward {now.measures['episode_reward']:.2f}, {now.measures['in_goal_end']:.0f} % in"

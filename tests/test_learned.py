@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 
 from shepherd_phys.bodies import Disc
 from shepherd_phys.controllers import CONTROLLERS, POLICIES, Policy, load_policy
-from shepherd_phys.controllers.evaluation import evaluate
+from shepherd_phys.controllers.evaluation import evaluate, trial_seed
 from shepherd_phys.controllers.network import Actor, SectorNetwork
 from shepherd_phys.controllers.policy_files import (
     FIELDS,
@@ -181,6 +181,34 @@ def test_chance_is_drawn_anew_after_its_time_in_proportion_to_the_deviation_and_
     np.testing.assert_array_equal(acts(0.5, 7), acts(0.5, 7))
     np.testing.assert_array_equal(acts(0.0, 7), acts(0.0, 8))
     assert (acts(0.0, 7) == pytest.approx(np.tile(mean, (7, 1, 1)))) and not np.array_equal(acts(0.5, 7), acts(0.5, 8))
+
+
+def test_chance_rest_interval_and_the_goals_frame_go_together():
+    weights = random_weights(SMALL, LIDAR)
+    weights["log_std"][:] = (-1.0, -0.5)
+    for name in ("action.weight", "action.bias"):
+        weights[name] *= 0.4
+    policy = Policy(spec_of(noise=0.5, noise_steps=3, rest=0.4, interval=2), weights)
+    env = ShepherdingEnv("small", rewards={}, lidar=policy.lidar)
+    reference = ShepherdingEnv("small", rewards={}, lidar=LIDAR)  # rolls by itself
+    observation, _ = env.reset(seed=3)
+    seen, _ = reference.reset(seed=3)
+    policy.reset(np.random.default_rng(7))
+    rng, actor, rests = np.random.default_rng(7), Actor(SMALL, LIDAR, weights), []
+    for k in range(18):
+        if k % 3 == 0:
+            chance = 0.5 * rng.standard_normal((len(seen), 2))
+        if k % 2 == 0:
+            mean, deviation = actor(seen)
+            raw = np.clip(mean + chance * deviation, -1, 1)
+            speed = np.linalg.norm(raw, axis=1, keepdims=True)
+            wanted = turn(np.where(speed < 0.4, 0.0, raw / np.maximum(speed, 1)), reference.beam_offset, 64)
+            rests += list(speed < 0.4)
+        action = policy.act(observation, env.state)
+        assert action == pytest.approx(wanted, abs=1e-5)
+        observation, *_ = env.step(action)
+        seen, *_ = reference.step(action)
+    assert any(rests) and not all(rests)
 
 
 def test_less_than_the_least_speed_is_standing_still():
@@ -567,7 +595,25 @@ def test_the_command_line_takes_a_policy_file_and_knows_it_by_its_checksum(polic
     assert hashes[0] == hashes[1] != hashes[2]
 
 
+def texts(data):
+    """All texts in plain data."""
+    if isinstance(data, dict | list):
+        return [text for part in (data.values() if isinstance(data, dict) else data) for text in texts(part)]
+    return [data] if isinstance(data, str) else []
+
+
 def test_every_shipped_policy_is_a_controller_and_whole():
+    assert set(POLICIES) == {"any", "collie", "original", "wild"}
     for name in POLICIES:
         assert CONTROLLERS[name] is POLICIES[name]
-        assert POLICIES[name]().checksum
+        policy = POLICIES[name]()
+        assert policy.checksum
+        said = texts(policy.spec.training)
+        assert said and not [text for text in said if "/" in text]  # no path of whoever trained it
+
+
+@pytest.mark.parametrize("name", ["wild", "collie"])
+def test_a_shipped_policy_brings_the_sheep_home(name):
+    """A whole episode on a validation seed."""
+    (row,) = evaluate(POLICIES[name](), partial(ShepherdingEnv, SCENARIOS["paper"]), [trial_seed(10_000, 0)])
+    assert row["in_goal_end"] >= 95.0

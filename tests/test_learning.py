@@ -99,6 +99,22 @@ def test_the_actor_sees_its_lidar_alone_and_the_critic_the_world():
     assert actor == set(SMALL.shapes(LIDAR))
 
 
+def test_features_made_together_are_those_made_apart():
+    """Learning cuts the lidar once for actor and critic; stable-baselines3 asks for either alone, too."""
+    policy = policy_of(LIDAR, SMALL.but(overlap=2), critic_numbers=4)
+    observation = {"lidar": torch.rand((3, 6, 16)), "critic": torch.rand((3, 4))}
+    with torch.no_grad():
+        for parameter in policy.parameters():  # the last layers begin near 0, which would hide a difference
+            parameter.add_(0.1 * torch.randn_like(parameter))
+        alone, value = policy.get_distribution(observation), policy.predict_values(observation)
+        actions, values, log_prob = policy(observation)
+        again, log_prob_again, entropy = policy.evaluate_actions(observation, actions)
+    assert torch.equal(values, value) and torch.equal(again, value)
+    assert torch.equal(log_prob, alone.log_prob(actions)) and torch.equal(log_prob_again, log_prob)
+    assert torch.equal(entropy, alone.entropy())
+    assert np.ptp(value.numpy()) > 1e-3
+
+
 def test_actor_and_critic_share_no_weight():
     policy = policy_of(LIDAR, SMALL)
     observation = {"lidar": torch.rand((3, 6, 16))}

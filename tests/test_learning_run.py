@@ -268,6 +268,7 @@ def test_a_run_that_ends_sooner_goes_on_as_the_longer_one(unbroken, tmp_path):
     seen = []
     train(tmp_path, preset=PRESET.but(budget=240), report=seen.append)
     assert len(rows_of(tmp_path / "curve.csv")) == 2 and {told.length for told in seen} == {240}
+    assert [told.done for told in seen] == [0.5, 1.0, 1.0]  # the last of the validation
     assert Preset.from_toml(tmp_path / "preset.toml") == PRESET
     assert load_policy(tmp_path / "policy.json").spec.training["budget"] == PRESET.budget
     train(tmp_path)
@@ -347,6 +348,7 @@ def test_tensorboard_shows_each_rollout_once(unbroken, tmp_path):
     curve = rows_of(tmp_path / "curve.csv")
     whole = shown(tmp_path)
     assert whole == shown(unbroken)
+    assert "train/n_updates" not in whole  # as stable-baselines3 has it
     assert [step for step, _ in whole["time/shepherd_steps"]] == [int(row["decisions"]) for row in curve]
     assert [value for _, value in whole["train/value_loss"]] == pytest.approx(
         [float(row["value_loss"]) for row in curve]

@@ -45,7 +45,9 @@ class Progress(NamedTuple):
 
     shepherd_steps: int
     length: int
-    """Of the whole run."""
+    """Shepherd-steps of the whole run, not counting that the end of an episode cuts a decision short."""
+    done: float
+    """Part of the run's rollouts that are done."""
     rate: float
     """Shepherd-steps a second since this process began to train, validations left out."""
     measures: Mapping[str, float]
@@ -173,8 +175,10 @@ class _TensorBoard(KVWriter):
         self._writer = SummaryWriter(str(folder), purge_step=decisions + 1)
 
     def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
-        """Write all numbers at a step, which counts decisions."""
+        """Write the numbers that are meant for TensorBoard at a step, which counts decisions."""
         for name, value in key_values.items():
+            if "tensorboard" in key_excluded.get(name, ()):
+                continue
             self._writer.add_scalar(name, value, step)
         self._writer.flush()
 
@@ -289,7 +293,9 @@ class _Run:
         steps = self._learner.shepherd_steps
         rate = self._clock.rate(steps)
         length = self._n_rollouts * self._learner.preset.rollout_steps
-        self._report(Progress(steps, length, rate, self._measures, validation))
+        self._report(
+            Progress(steps, length, self._learner.rollouts / self._n_rollouts, rate, self._measures, validation)
+        )
 
 
 def _chosen_of(saved: Checkpoint) -> dict[str, Chosen]:
