@@ -67,14 +67,15 @@ def ablations(n_seeds: int, budget: int) -> list[Run]:
     """The runs of the ablations, seed by seed, so that an unfinished study knows something about every variant.
 
     Runs end with whole checkpoint intervals, which the presets count in rollouts: here all have intervals of as many
-    shepherd-steps as `fast`, rounded up to whole rollouts, so that no variant trains longer than another.
+    shepherd-steps as the first variant, `fast`, rounded up to whole rollouts, so that none trains longer than another.
 
     Args:
         n_seeds: runs of each variant.
         budget: shepherd-steps of each.
     """
-    fast = load_preset("fast")
-    interval = fast.checkpoint_rollouts * fast.rollout_steps
+    compared = variants()
+    first = next(iter(compared.values()))
+    interval = first.checkpoint_rollouts * first.rollout_steps
     return [
         Run(
             f"ablation-{name}-{seed}",
@@ -87,7 +88,7 @@ def ablations(n_seeds: int, budget: int) -> list[Run]:
             ),
         )
         for seed in range(FIRST_SEED, FIRST_SEED + n_seeds)
-        for name, preset in variants().items()
+        for name, preset in compared.items()
     ]
 
 
