@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .curves import WINDOW, curve_of, later_by
+from .curves import WINDOW, Curve, curve_of, later_by, levels_off_at
 from .summary import correlation, intervals
 
 Floats = NDArray[np.float64]
@@ -93,9 +93,7 @@ class Side:
         return UNDECIDED
 
     def _holds(self, number: float) -> bool:
-        if self.strict:
-            return self.least < number < self.most
-        return self.least <= number <= self.most
+        return self.least < number < self.most if self.strict else self.least <= number <= self.most
 
     def __str__(self) -> str:
         if math.isinf(self.most):
@@ -122,6 +120,8 @@ class Part:
     note: str = ""
     recipe: str | None = None
     """Of the training that it is about, where it is about training."""
+    budget: float | None = None
+    """Shepherd-steps of that training."""
 
     @property
     def verdict(self) -> str:
@@ -131,7 +131,7 @@ class Part:
         return self.side.verdict(self.low, self.high)
 
     def to_dict(self) -> dict[str, Any]:
-        """As plain data; ends at infinity are None."""
+        """As plain data; ends at infinity, of the interval and of the side, are None."""
         flocks, n = self.at or (None, None)
         return {
             "method": self.method,
@@ -139,16 +139,21 @@ class Part:
             "n_flocks": flocks,
             "cohesion": n,
             "value": self.value,
-            "low": self.low,
-            "high": self.high,
+            "low": _finite(self.low),
+            "high": _finite(self.high),
             "claimed": str(self.side),
-            "least": None if math.isinf(self.side.least) else self.side.least,
-            "most": None if math.isinf(self.side.most) else self.side.most,
+            "least": _finite(self.side.least),
+            "most": _finite(self.side.most),
             "verdict": self.verdict,
             "counts": self.counts,
             "note": self.note,
             "recipe": self.recipe,
+            "budget": self.budget,
         }
+
+
+def _finite(number: float | None) -> float | None:
+    return None if number is None or math.isinf(number) else number
 
 
 @dataclass(frozen=True)
@@ -293,7 +298,11 @@ def _follows_n(trials: Trials, metric: str, side: Side) -> Iterator[Part]:
 
 
 def _levels_off_before(trials: Trials, first: str, then: str) -> Iterator[Part]:
-    """c8: difference of the shepherd-steps at which two schemes level off, bootstrapped over seeds."""
+    """c8: difference of the shepherd-steps at which two schemes level off, bootstrapped over seeds.
+
+    Both curves end with the same rollout: where one levels off depends on its length. Where one does not by then,
+    nobody knows which is earlier.
+    """
     ran = {row["recipe"] for row in trials.curves}
     for recipe in (RECIPE, *([PAPERS_RECIPE] if PAPERS_RECIPE in ran else [])):
         part = Part(then, Side(least=0.0, strict=True), first, counts=recipe == RECIPE, recipe=recipe)
@@ -303,11 +312,21 @@ def _levels_off_before(trials: Trials, first: str, then: str) -> Iterator[Part]:
             yield replace(part, note=f"not run: {', '.join(missing)}")
         elif min(len(curve.seeds) for curve in curves.values()) < LEAST_SEEDS:
             yield replace(part, note=f"fewer than {LEAST_SEEDS} seeds")
-        elif min(len(curve.steps) for curve in curves.values()) < WINDOW:
-            yield replace(part, note=f"fewer than {WINDOW} evaluations")
         else:
-            value, low, high = (steps / 1e6 for steps in later_by(curves[then], curves[first]))
-            yield replace(part, value=value, low=low, high=high)
+            last = min(max(curve.rollouts, default=0) for curve in curves.values())
+            yield _later(part, *(curves[name].until(last) for name in (then, first)))
+
+
+def _later(part: Part, curve: Curve, other: Curve) -> Part:
+    """What is known of a curve's levelling off later than another's."""
+    if min(len(own.steps) for own in (curve, other)) < WINDOW:
+        return replace(part, note=f"fewer than {WINDOW} evaluations")
+    part = replace(part, budget=float(max(own.steps[-1] for own in (curve, other))))
+    later = later_by(curve, other)
+    if later.value is None:
+        late = [method for method, own in ((part.method, curve), (part.rival, other)) if levels_off_at(own) is None]
+        return replace(part, note="neither levels off" if len(late) == 2 else f"{late[0]} does not level off")
+    return replace(part, value=later.value / 1e6, low=later.low / 1e6, high=later.high / 1e6)
 
 
 def _learned(trials: Trials) -> list[tuple[str, bool]]:

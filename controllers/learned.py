@@ -24,7 +24,8 @@ SHIPPED = Path(__file__).parent / "policies"
 class Policy:
     """Moves every shepherd by the same network, each by its own observation alone.
 
-    Deterministic: the action is the mean of the distribution that it had while learning, clipped to the unit disc.
+    The action is the mean of the distribution that it had while learning, clipped to the unit disc; where
+    ``spec.action.noise`` says so with chance added, a function of the episode's seed.
 
     Args:
         spec: what it was trained with.
@@ -50,6 +51,8 @@ class Policy:
         self._directions = beam_directions(spec.lidar.beams)
         self._offset: NDArray[np.int64] | None = None
         self._action: NDArray[np.float64] | None = None
+        self._rng = np.random.default_rng(0)
+        self._chance = np.zeros((0, 2))
 
     @classmethod
     def load(cls, path: str | Path, classes: Iterable[Any] = ()) -> Self:
@@ -65,6 +68,7 @@ class Policy:
     def reset(self, rng: np.random.Generator) -> None:
         """Forget the last episode."""
         self._offset = self._action = None
+        self._rng = rng
 
     def act(self, observation: NDArray[np.float32], state: WorldState) -> NDArray[np.float64]:
         """(P, 2).
@@ -80,8 +84,14 @@ class Policy:
             self._offset = np.zeros(n, np.int64)
         if self._rolls:
             observation, self._offset = observe(observation.reshape(n, *self._frames), self._offset, self._observed)
+        acting = self.spec.action
+        first = self._action is None
+        if acting.noise and (first or state.step % acting.noise_steps == 0):
+            self._chance = acting.noise * self._rng.standard_normal((n, 2))
         if self._action is None or state.step % self._interval == 0:
-            self._action = _wanted(self._actor(observation), self._offset, self._directions, self.spec.action.rest)
+            mean, deviation = self._actor(observation)
+            action = mean + self._chance * deviation if acting.noise else mean
+            self._action = _wanted(action, self._offset, self._directions, acting.rest)
         return self._action.copy()
 
     def to_dict(self) -> dict[str, Any]:

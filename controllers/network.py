@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -26,7 +27,8 @@ class SectorNetwork(Settings):
         group g:  relu(W_1 x_g + b_1),  x_g the (R, overlap + group + overlap) numbers of the group and its neighbours
         hidden:   relu(W_2 [all groups] + b_2)
         latent:   tanh(W_3 . + b_3)
-        action:   W_4 . + b_4, the mean of the action's distribution while learning
+        action:   W_4 . + b_4, the mean of the action's distribution
+        its standard deviations:  exp(log_std)
 
     All groups use the same W_1, as a convolution does, and beams wrap around: the neighbours of the first group are the
     last one's columns. There is no normalisation of any input.
@@ -78,6 +80,11 @@ ARCHITECTURES: dict[str, type[SectorNetwork]] = {"SectorNetwork": SectorNetwork}
 """By name, for policy files."""
 
 
+def without_scatter(table: Mapping[str, Any]) -> dict[str, Any]:
+    """A network's fields without ``scatter``: the policies and runs of earlier versions say that it is false."""
+    return {name: value for name, value in table.items() if name != "scatter" or value is not False}
+
+
 def input_shape(lidar: Lidar) -> tuple[int, int]:
     """(R, C): rows and columns of one shepherd's observation, as a network takes it.
 
@@ -96,7 +103,7 @@ class Actor:
     Args:
         network: its sizes.
         lidar: of the observations.
-        weights: arrays of the names and shapes that ``network.shapes(lidar)`` tells; ``log_std`` is not used.
+        weights: arrays of the names and shapes that ``network.shapes(lidar)`` tells.
     """
 
     def __init__(self, network: SectorNetwork, lidar: Lidar, weights: Weights) -> None:
@@ -108,17 +115,18 @@ class Actor:
             for name in ("groups", "hidden", "latent", "action")
             for array in (np.array(weights[f"{name}.weight"].T, order="C"), np.array(weights[f"{name}.bias"]))
         ]
+        self._log_std = np.array(weights["log_std"])
 
-    def __call__(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(P, 2) actions, not clipped, of P observations (P, R, C) float32."""
+    def __call__(self, observation: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Means and standard deviations (P, 2), not clipped, of the actions for P observations (P, R, C) float32."""
         if observation.shape[1:] != self._shape:
             raise ValueError(
                 f"observation: needs the shape (P, {self._shape[0]}, {self._shape[1]}), has {observation.shape}"
             )
-        actions: NDArray[np.float32] = _forward(
+        outputs: NDArray[np.float32] = _forward(
             np.ascontiguousarray(observation, np.float32), self._group, self._overlap, *self._layers
         )
-        return actions
+        return outputs, np.exp(np.broadcast_to(self._log_std, outputs.shape))
 
 
 @njit(cache=True, error_model="numpy")
@@ -149,7 +157,7 @@ def _forward(observation, group, overlap, w1, b1, w2, b2, w3, b3, w4, b4):  # ty
     latent = np.empty((n, len(b3)), np.float32)
     latent[:] = b3
     _add_layer(latent, hidden, w3)
-    action = np.empty((n, 2), np.float32)
+    action = np.empty((n, len(b4)), np.float32)
     action[:] = b4
     for p in range(n):
         for j in range(len(b3)):

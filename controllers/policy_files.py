@@ -27,7 +27,7 @@ from shepherd_phys.lidar import Lidar
 from shepherd_phys.scenario import Scenario
 from shepherd_phys.settings import Settings, SettingsError, settings, tagged, untagged
 
-from .network import ARCHITECTURES, SectorNetwork
+from .network import ARCHITECTURES, SectorNetwork, without_scatter
 
 FORMAT = "shepherd_phys policy"
 FORMAT_VERSION = 1
@@ -56,6 +56,11 @@ class Acting(Settings):
     rest: float = Field(default=0.0, ge=0, lt=1)
     """Wanted speeds below this part of the top speed mean standing still: an output that is never quite 0 creeps tens
     of metres in an episode."""
+    noise: float = Field(default=0.0, ge=0, le=1)
+    """Standard deviations of its distribution by which actions scatter: 0: its mean, 1: as while learning. Shepherds
+    of one mind that see the same may all wait for one another for good; chance ends that."""
+    noise_steps: int = Field(default=5, ge=1, le=1000)
+    """Control steps for which what chance adds is held; while learning those of a decision."""
 
 
 @dataclass(frozen=True)
@@ -180,7 +185,7 @@ def _spec(table: Mapping[str, Any], classes: Iterable[Any]) -> PolicySpec:
 
 
 def _network(table: Mapping[str, Any]) -> SectorNetwork:
-    network = untagged(table, ARCHITECTURES, "network")
+    network = untagged(without_scatter(table), ARCHITECTURES, "network")
     if not isinstance(network, SectorNetwork):  # module:Name
         raise PolicyError(f"network.kind: {_brief(repr(table['kind']))} is unknown; known: {', '.join(ARCHITECTURES)}")
     return network

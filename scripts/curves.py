@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from shepherd_phys.controllers.curves import COLUMNS
 from shepherd_phys.learning import checkpoints
 from shepherd_phys.learning.checkpoints import CheckpointError
-from shepherd_phys.learning.folder import CHECKPOINTS, CURVE, PRESET, VALIDATION, agree, begin
+from shepherd_phys.learning.folder import CHECKPOINTS, CURVE, PRESET, VALIDATION, agree, begin, ended, exported
 from shepherd_phys.learning.studies import Run
 from shepherd_phys.settings import SettingsError
 from shepherd_phys.workers import Job, Workers, WorkersError, finished
@@ -48,15 +48,15 @@ class Failed(NamedTuple):
 
 
 def unfinished(runs: Iterable[Run], folder: Path) -> list[Run]:
-    """Those of the runs whose end no checkpoint holds.
+    """Those of the runs whose end no checkpoint holds, or whose policy files are not those of the last one.
 
     Raises:
         SettingsError: a folder holds a run with other settings, or checkpoints that cannot be read.
     """
-    return [run for run in runs if not _ended(run, folder / run.name)]
+    return [run for run in runs if not _whole(run, folder / run.name)]
 
 
-def _ended(run: Run, place: Path) -> bool:
+def _whole(run: Run, place: Path) -> bool:
     if not (place / PRESET).exists():
         return False
     try:
@@ -66,10 +66,7 @@ def _ended(run: Run, place: Path) -> bool:
         raise SettingsError(f"{error}; another --out begins anew") from None
     except CheckpointError as error:
         raise SettingsError(str(error)) from None
-    if saved is None:
-        return False
-    steps, seconds = saved.facts["shepherd_steps"], saved.facts["seconds"]
-    return bool(steps >= run.preset.budget or seconds >= 3600.0 * run.hours)
+    return saved is not None and ended(saved, run.preset.n_rollouts, 3600.0 * run.hours) and exported(place, saved)
 
 
 def one_by_one(runs: Sequence[Run], folder: Path, workers: int) -> list[Failed]:
@@ -86,12 +83,14 @@ def one_by_one(runs: Sequence[Run], folder: Path, workers: int) -> list[Failed]:
 
 def side_by_side(runs: Sequence[Run], folder: Path, workers: int) -> list[Failed]:
     """Train as many runs at a time as there are workers, each with one: the most runs in a given time."""
+    if not runs:
+        return []
     if workers < 2:
         return one_by_one(runs, folder, 1)
     jobs = deque(Job(i, (run, folder / run.name), run.preset.seed) for i, run in enumerate(runs))
     causes: dict[int, str] = {}
     try:
-        with Workers(_job, min(workers, max(1, len(runs))), math.inf) as crew:
+        with Workers(_job, min(workers, len(runs)), math.inf) as crew:
             for end in finished(crew, jobs):
                 causes[end.key] = end.cause
     except WorkersError as error:
@@ -118,9 +117,7 @@ def _train(run: Run, place: Path, workers: int) -> str:
     try:
         if not (place / PRESET).exists():
             begin(place, run.preset)
-        elif agree(place, run.preset) != run.preset:
-            run.preset.to_toml(place / PRESET)  # a longer run is the same run
-        train(place, workers, _teller(run.name), 3600.0 * run.hours)
+        train(place, workers, _teller(run.name), 3600.0 * run.hours, run.preset)
     except (
         CheckpointError,
         OSError,
@@ -176,7 +173,7 @@ def _value(name: str, text: str) -> Any:
 
 
 def gather(runs: Sequence[Run], folder: Path) -> tuple[list[Row], list[Row]]:
-    """The curves and the validations of runs, up to the budget that they have here: a folder may hold a longer run.
+    """The curves and the validations of runs, as long as they are here: a folder may hold a longer run.
 
     Returns:
         rows with the columns `COLUMNS`, those in which whole episodes ended and the last of each run; rows with the
@@ -190,7 +187,7 @@ def gather(runs: Sequence[Run], folder: Path) -> tuple[list[Row], list[Row]]:
     for run in runs:
         labels = {"recipe": run.recipe, "reward": run.preset.reward, "seed": run.preset.seed}
         rows = read_rows(folder / run.name / CURVE, [name for name in COLUMNS if name not in labels])
-        rows = _up_to(rows, run.preset.budget)
+        rows = _up_to(rows, run)
         found.append((run, [{**labels, **row} for row in rows]))
         taken = {row["shepherd_steps"]: row["seconds"] for row in rows}
         columns = [name for name in VALIDATIONS if name not in (*labels, "seconds")]
@@ -204,10 +201,13 @@ def gather(runs: Sequence[Run], folder: Path) -> tuple[list[Row], list[Row]]:
     return curves, validations
 
 
-def _up_to(rows: Sequence[Row], budget: int) -> list[Row]:
-    """The rows of the run that had this budget: all but those after the first that reaches it."""
-    before = sum(row["shepherd_steps"] < budget for row in rows)
-    return list(rows[: before + 1])
+def _up_to(rows: Sequence[Row], run: Run) -> list[Row]:
+    """The rows of the rollouts that the run has: it ends with the checkpoint at which its time is up, too."""
+    last = run.preset.n_rollouts
+    late = [row["rollout"] for row in rows if row["seconds"] >= 3600.0 * run.hours]
+    if late:
+        last = min(last, run.preset.checkpoint_rollouts * math.ceil(min(late) / run.preset.checkpoint_rollouts))
+    return [row for row in rows if row["rollout"] <= last]
 
 
 def binned(rows: Sequence[Row], width: int) -> list[Row]:

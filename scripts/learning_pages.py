@@ -12,6 +12,8 @@ from .pages import line
 
 Scheme = tuple[str, str]
 """(recipe, reward)."""
+TIMED = ("fast", "wild")
+"""The scheme of whose runs the time to home is told."""
 HALF = 50.0
 """Sheep in at the end of training episodes that count as a beginning [%]."""
 
@@ -22,7 +24,7 @@ def figure1_page(curves: Sequence[Row], validations: Sequence[Row], home: Sequen
     Args:
         curves: rows of ``figure1.csv``.
         validations: rows of ``figure1-validation.csv``.
-        home: rows of ``time-to-home.csv``.
+        home: rows of ``time-to-home.csv``, of runs of `TIMED` that were trained alone.
     """
     flocks = _flocks(validations)
     head = ["recipe", "reward", "seeds", "final reward", "levels off at", *map(_flocks_word, flocks), "rate", "time"]
@@ -32,16 +34,24 @@ def figure1_page(curves: Sequence[Row], validations: Sequence[Row], home: Sequen
         "![Figure 1: mean episode reward, and sheep delivered in validation, against shepherd-steps](figure1.png)",
         "",
         "Made by `shepherd-phys reproduce`. Of each scheme, over its seeds: the mean reward of training episodes over "
-        f"the last {WINDOW} evaluations (rollouts); where the curve levels off [M shepherd-steps]; sheep in the goal "
-        "at the end of the last validation's episodes, %; shepherd-steps a second and wall-clock time of training, "
-        "validations left out.",
+        f"the last {WINDOW} evaluations (rollouts); where the curve levels off [M shepherd-steps], if not only in the "
+        "last tenth of its length; sheep in the goal at the end of the last validation's episodes, %; shepherd-steps a "
+        "second and wall-clock time of training, validations left out.",
+        "",
+        "The runs whose time to home is told below were trained one at a time, with all worker processes; rate and "
+        "time of `fast` with `wild` are of these alone. All the others had one process each, as many of them at a "
+        "time as there were workers: the one of the preset `paper`, too, whose training was limited to a time, not "
+        "to a number of steps.",
         "",
         line(head),
         line(["---", "---", *["---:"] * (len(head) - 2)]),
     ]
+    timed = {row["seed"] for row in home}
     for recipe, reward in _schemes(curves):
         curve = curve_of(curves, recipe, reward)
         lasts = _lasts(curves, recipe, reward)
+        alone = [row for row in lasts if (recipe, reward) == TIMED and row["seed"] in timed]
+        paced = alone or lasts
         off = levels_off_at(curve)
         at_end = _at_end(validations, recipe, reward)
         lines.append(
@@ -51,14 +61,21 @@ def figure1_page(curves: Sequence[Row], validations: Sequence[Row], home: Sequen
                     reward,
                     str(len(curve.seeds)),
                     _number(final_value(curve), ".2f"),
-                    "not before its end" if off is None else f"{off / 1e6:.2f}",
+                    _levels_off(off, lasts),
                     *(_number(_mean(at_end.get(k, [])), ".1f") for k in flocks),
-                    _rate(lasts),
-                    clock(_total(lasts, "seconds") / len(lasts)),
+                    _rate(paced),
+                    clock(_total(paced, "seconds") / len(paced)),
                 ]
             )
         )
     return "\n".join([*lines, *_home(home), ""])
+
+
+def _levels_off(at: float | None, lasts: Sequence[Row]) -> str:
+    """M shepherd-steps, or those within which the curve does not level off."""
+    if at is not None:
+        return f"{at / 1e6:.2f}"
+    return f"not within {_total(lasts, 'shepherd_steps') / len(lasts) / 1e6:.2f}"
 
 
 def _home(home: Sequence[Row]) -> list[str]:
@@ -69,7 +86,8 @@ def _home(home: Sequence[Row]) -> list[str]:
         "",
         "**Time to home**",
         "",
-        f"Training until the first checkpoint whose policy delivers at least {HOME:g} % with each number of flocks in "
+        f"Of the first runs of `{TIMED[1]}`, each trained with nothing beside it: training until the first checkpoint "
+        f"whose policy delivers at least {HOME:g} % with each number of flocks in "
         "validation; that policy, judged once on reported trials: sheep in the goal at the end, %, mean [95 % "
         "bootstrap interval].",
         "",
@@ -105,7 +123,7 @@ def ablations_page(curves: Sequence[Row], validations: Sequence[Row]) -> str:
         "Made by `shepherd-phys reproduce`. Of each variant, over its seeds: sheep in the goal at the end of "
         "validation episodes after training, %, mean (least to most); the mean reward of training episodes over the "
         f"last {WINDOW} evaluations (rollouts); M shepherd-steps when training episodes first ended with half of the "
-        "sheep in; shepherd-steps a second of one process, other runs beside it.",
+        "sheep in; shepherd-steps a second of one process, as many runs at a time as there were workers.",
         "",
         line(head),
         line(["---", *["---:"] * (len(head) - 1)]),

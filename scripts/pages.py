@@ -114,10 +114,21 @@ def part_cells(part: Mapping[str, Any]) -> tuple[str, ...]:
     at = "" if part["n_flocks"] is None else f"flocks: {part['n_flocks']}, n = {part['cohesion']}"
     if part.get("recipe") is not None:  # what was judged before there were recipes has none
         at = f"recipe {part['recipe']}"
+        if part.get("budget") is not None:
+            at += f", {part['budget'] / 1e6:.2f} M shepherd-steps"
     digits = ".2f" if 0 in (part["least"], part["most"]) else ".1f"  # a correlation, or percent and metres
-    value = part["note"] if part["value"] is None else _interval(part, "value", "", digits)
+    value = part["note"]
+    if part["value"] is not None:
+        value = _known(part, digits)
     verdict = part["verdict"] if part["counts"] else f"({part['verdict']}, beside)"
     return method, at, value, part["claimed"], verdict
+
+
+def _known(part: Mapping[str, Any], digits: str) -> str:
+    """The number of a part; ends of its interval may be at infinity."""
+    low = "-∞" if part["low"] is None else f"{part['low']:{digits}}"
+    high = "∞" if part["high"] is None else f"{part['high']:{digits}}"
+    return f"{part['value']:{digits}} [{low}, {high}]"
 
 
 def _interval(row: Mapping[str, Any], value: str, prefix: str, digits: str) -> str:

@@ -70,13 +70,13 @@ class Reproduce:
     """Root seed: trial i has a seed derived from S and i alone, the same for every controller and point."""
     seeds: Annotated[int | None, flag("K", "5 in figure1, 3 in ablations")] = None
     """Training runs of each scheme or variant, with seeds from 1,000,000."""
-    budget: Annotated[int | None, flag("N", "6,000,000 in figure1, 2,500,000 in ablations")] = None
-    """Shepherd-steps of each training run."""
+    budget: Annotated[int | None, flag("N", "6,400,000 in figure1, 2,500,000 in ablations")] = None
+    """Shepherd-steps of each training run, which ends with a whole checkpoint interval."""
     paper_hours: Annotated[float, flag("HOURS")] = 2.0
     """In figure1: hours of training for one run by the preset paper, drawn beside; 0: none."""
     workers: Annotated[int, flag("W")] = cpu_count()
-    """Worker processes; the results do not depend on it. figure1 trains one run at a time with all of them, ablations
-    as many runs at a time."""
+    """Worker processes; the results do not depend on it. figure1 trains the first three runs of wild one at a time
+    with all of them; all its other runs, and those of ablations, are trained as many at a time."""
     scheduler: Annotated[str | None, flag("ADDRESS", "")] = None
     """Instead of --workers: the scheduler of a Dask cluster, e.g. tcp://10.0.0.1:8786."""
     timeout: Annotated[float, flag("SECONDS")] = 600.0

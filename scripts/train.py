@@ -42,7 +42,7 @@ class Train:
     seed: Annotated[int | None, flag("S", "the preset's")] = None
     """Root of everything random; 1,000,000 and up is meant for training."""
     budget: Annotated[int | None, flag("N", "the preset's")] = None
-    """Shepherd-steps (control steps times shepherds) to train for."""
+    """Shepherd-steps (control steps times shepherds) to train for; a run ends with a whole checkpoint interval."""
     init: Annotated[str | None, flag("NAME|FILE", "the preset's")] = None
     """Policy to start from: a shipped one's name or a .json file."""
     workers: Annotated[int, flag("W")] = cpu_count()
@@ -75,12 +75,13 @@ def main(argv: Sequence[str]) -> int:
     from shepherd_phys.workers import WorkersError
 
     print(
-        f"{folder}: {preset.worlds} worlds, {preset.n_slots} shepherds, {preset.budget:,} shepherd-steps",
+        f"{folder}: {preset.worlds} worlds, {preset.n_slots} shepherds, {preset.n_rollouts:,} rollouts of "
+        f"{preset.rollout_steps:,} shepherd-steps",
         file=sys.stderr,
     )
     with progress_bar() as report:
         try:
-            best = train(folder, options.workers, report)
+            best = train(folder, options.workers, report, preset=preset)
         except SettingsError as error:
             return fail(PROG, error, 2)
         except (CheckpointError, TrainingError, ValidationError, WorkerError, WorkersError, OSError) as error:
@@ -96,7 +97,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def prepare(options: Train, given: set[str]) -> tuple[Path, Preset]:
-    """The folder of the run and its preset; a new run's folder is made.
+    """The folder of the run, and what its preset shall be; a new run's folder is made, another one left as it is.
 
     Raises:
         SettingsError: the folder holds another run, or none to resume; or the preset is impossible.
@@ -114,9 +115,7 @@ def prepare(options: Train, given: set[str]) -> tuple[Path, Preset]:
             agree(options.out, changed)
         except SettingsError as error:
             raise SettingsError(f"{error}; --resume needs none but --out") from None
-        if changed != preset:
-            changed.to_toml(options.out / PRESET)
-        return options.out, changed
+        return options.out, changed  # `train` writes it, once nobody else is at the run
     preset = load_preset(options.preset).but(**changes)
     folder = options.out or Path("runs") / f"{Path(options.preset).stem}-{preset.reward}-{preset.seed}"
     preset.start()  # before a folder is made that the next attempt would find
@@ -141,7 +140,7 @@ def progress_bar() -> Iterator[Any]:
             console.print(validation_of(now), soft_wrap=True)
             return
         told = pace_of(now)
-        bar.update(shown, total=now.budget, completed=min(now.shepherd_steps, now.budget), told=told)
+        bar.update(shown, total=1.0, completed=now.done, told=told)
         if not console.is_terminal and time.monotonic() - logged > LOG_SECONDS:
             logged = time.monotonic()
             print(f"{now.shepherd_steps:,} shepherd-steps: {told}", file=sys.stderr, flush=True)
@@ -152,7 +151,7 @@ def progress_bar() -> Iterator[Any]:
 
 def pace_of(now: Any) -> str:
     """What a run reports of a rollout, in words; pace and time left are of training, without validations."""
-    left = clock(max(0, now.budget - now.shepherd_steps) / max(now.rate, 1e-9))
+    left = clock(max(0.0, 1.0 - now.done) * now.length / max(now.rate, 1e-9))
     told = f"{now.rate:,.0f} shepherd-steps/s, {left} of training left"
     if math.isfinite(now.measures["episode_reward"]):
         told += f", reward {now.measures['episode_reward']:.2f}, {now.measures['in_goal_end']:.0f} % in"

@@ -73,3 +73,12 @@ def rolled_sectors(rows: Any, offsets: Ints, out: Any) -> None:
                     best = rows[p, i, k] if rows[p, i, k] > best else best
                 out[p, i, j] = best
                 low = high if high < beams else high - beams
+
+
+@njit(cache=True)
+def turned(vectors: Any, cosine: Floats, sine: Floats, out: Any) -> None:
+    """Write vectors (P, 2) turned by angles, whose cosines and sines are given (P,)."""
+    for p in range(len(vectors)):
+        x, y = vectors[p, 0], vectors[p, 1]
+        out[p, 0] = cosine[p] * x - sine[p] * y
+        out[p, 1] = sine[p] * x + cosine[p] * y

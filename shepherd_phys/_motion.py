@@ -62,16 +62,19 @@ def servo(rows, command, mass, moment, h, limit, spin_limit, spins, force):  # t
 @numba.njit(cache=True)
 def measure(  # type: ignore[no-untyped-def]
     rows, command, heading, arrived, previous, path, goal, goal_radius,
-    sheep, distance, known, shepherds, lengths, poses,
+    vectors, numbers, flags, poses,
 ):  # fmt: skip
     """Write what a state holds; whether all is finite.
 
-    ``sheep`` (3, N, 2) positions, velocities, headings; ``distance`` (N,) to the goal; ``known`` (2, N) in the goal now
-    and ever; ``shepherds`` (2, P, 2) positions, velocities; ``lengths`` (2, P) angles, ways walked; ``poses`` of all.
+    ``vectors`` (3 N + 2 P, 2) positions, velocities and headings of the sheep, positions and velocities of the
+    shepherds; ``numbers`` (N + 2 P,) distances of the sheep to the goal, angles and ways walked of the shepherds;
+    ``flags`` (2, N) in the goal now and ever; ``poses`` of all.
     """
-    pos, vel, turned, inside, ever = sheep[0], sheep[1], sheep[2], known[0], known[1]
-    at, at_vel, angle, walked = shepherds[0], shepherds[1], lengths[0], lengths[1]
-    n, p = len(pos), len(at)
+    n, p = len(heading), len(previous)
+    pos, vel, turned = vectors[:n], vectors[n : 2 * n], vectors[2 * n : 3 * n]
+    at, at_vel = vectors[3 * n : 3 * n + p], vectors[3 * n + p :]
+    distance, angle, walked = numbers[:n], numbers[n : n + p], numbers[n + p :]
+    inside, ever = flags[0], flags[1]
     spins = rows.shape[1] == 6
     v = 3 if spins else 2
     total = 0.0  # not finite as soon as one of its terms is not

@@ -385,11 +385,14 @@ def _goal_offsets(rows: Proximities, first: int, last: NDArray[np.int64], lidar:
 
 
 def turn(action: NDArray[Any], offset: NDArray[np.int64], beams: int) -> NDArray[Any]:
-    """Vectors (P, 2) of the observed frame in world axes: turned by the angle of beam ``offset`` (P,)."""
+    """Vectors (P, 2) of the observed frame in world axes: turned by the angle of beam ``offset`` (P,).
+
+    Raises:
+        ValueError: there are not as many of one as of the other, or they have other shapes.
+    """
+    if offset.ndim != 1 or action.shape != (len(offset), 2):
+        raise ValueError(f"action: needs the shape (P, 2) with offsets (P,), has {action.shape} with {offset.shape}")
     angle = (2.0 * np.pi / beams) * offset
-    ca, sa = np.cos(angle), np.sin(angle)
-    x, y = action[..., 0], action[..., 1]
     turned = np.empty(action.shape, np.result_type(action.dtype, np.float32))
-    turned[..., 0] = ca * x - sa * y
-    turned[..., 1] = sa * x + ca * y
+    _frames.turned(action, np.cos(angle), np.sin(angle), turned)
     return turned

@@ -55,6 +55,8 @@ def _explain(cls: type[Any], error: pydantic.ValidationError) -> str:
     names = [f.name for f in dataclasses.fields(cls)]
     lines = []
     for problem in error.errors(include_url=False):
+        if problem["type"] == "default_factory_not_called":
+            continue  # its default follows from a field that is wrong, which is told
         path = list(problem["loc"])
         if path and isinstance(path[0], int) and path[0] < len(names):
             path[0] = names[path[0]]  # a positional argument: say which field it fills

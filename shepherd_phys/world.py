@@ -395,32 +395,31 @@ class World:
     ) -> WorldState:
         """Make the state of what was read."""
         scenario, n, p = self.scenario, self._n, self._p
-        # allocated here and not in the kernel: handing arrays over costs less than bringing them back
-        sheep, distance, known = np.empty((3, n, 2)), np.empty(n), np.empty((2, n), np.bool_)
-        shepherds, lengths = np.empty((2, p, 2)), np.empty((2, p))
+        # allocated here and not in the kernel: handing arrays over costs less than bringing them back; and few of them,
+        # of which the state's are slices: to make and to freeze each by itself took longer than to fill them
+        vectors, numbers, flags = np.empty((3 * n + 2 * p, 2)), np.empty(n + 2 * p), np.empty((2, n), np.bool_)
         if not _motion.measure(
             rows, self._command, heading, arrived, previous, path, self._goal, scenario.goal_radius,
-            sheep, distance, known, shepherds, lengths, self._poses,
+            vectors, numbers, flags, self._poses,
         ):  # fmt: skip
             raise NonFiniteError("the engine gave positions or velocities that are not finite")
-        for array in (sheep, distance, known, shepherds, lengths):
+        for array in (vectors, numbers, flags):
             array.setflags(write=False)
-        (pos, vel, turned), (inside, ever), (at, at_vel), (angle, walked) = sheep, known, shepherds, lengths
         return WorldState.of(
             {
                 **self._constant,
                 "step": step,
                 "time": step * scenario.control_dt,
-                "sheep_pos": pos,
-                "sheep_vel": vel,
-                "sheep_heading": turned,
-                "sheep_goal_distance": distance,
-                "sheep_in_goal": inside,
-                "sheep_arrived": ever,
-                "shepherd_pos": at,
-                "shepherd_vel": at_vel,
-                "shepherd_angle": angle,
-                "shepherd_path": walked,
+                "sheep_pos": vectors[:n],
+                "sheep_vel": vectors[n : 2 * n],
+                "sheep_heading": vectors[2 * n : 3 * n],
+                "sheep_goal_distance": numbers[:n],
+                "sheep_in_goal": flags[0],
+                "sheep_arrived": flags[1],
+                "shepherd_pos": vectors[3 * n : 3 * n + p],
+                "shepherd_vel": vectors[3 * n + p :],
+                "shepherd_angle": numbers[n : n + p],
+                "shepherd_path": numbers[n + p :],
                 "collisions": self._contacts.count,
             }
         )

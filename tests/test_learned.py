@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 
 from shepherd_phys.bodies import Disc
 from shepherd_phys.controllers import CONTROLLERS, POLICIES, Policy, load_policy
-from shepherd_phys.controllers.evaluation import evaluate
+from shepherd_phys.controllers.evaluation import evaluate, trial_seed
 from shepherd_phys.controllers.network import Actor, SectorNetwork
 from shepherd_phys.controllers.policy_files import (
     FIELDS,
@@ -86,7 +86,7 @@ def test_the_network_is_its_formulas(overlap, density):
     rng = np.random.default_rng(1)
     observation = rng.random((4, 6, 16), dtype=np.float32) * (rng.random((4, 6, 16)) < density)
     wanted = [by_hand(weights, network, one) for one in observation]
-    assert Actor(network, LIDAR, weights)(observation) == pytest.approx(np.array(wanted), abs=1e-5)
+    assert Actor(network, LIDAR, weights)(observation)[0] == pytest.approx(np.array(wanted), abs=1e-5)
 
 
 def test_a_turn_by_a_group_only_permutes_the_groups():
@@ -98,7 +98,8 @@ def test_a_turn_by_a_group_only_permutes_the_groups():
     turned["hidden.bias"] = weights["hidden.bias"]
     observation = np.random.default_rng(2).random((1, 6, 16), dtype=np.float32)
     rolled = np.roll(observation, 4, axis=2)
-    assert Actor(network, LIDAR, weights)(observation) == pytest.approx(Actor(network, LIDAR, turned)(rolled), abs=1e-6)
+    wanted = Actor(network, LIDAR, turned)(rolled)[0]
+    assert Actor(network, LIDAR, weights)(observation)[0] == pytest.approx(wanted, abs=1e-6)
 
 
 def test_what_is_written_is_read(policy_path):
@@ -139,7 +140,7 @@ def test_actions_lie_in_the_unit_disc(seed):
     observation = np.random.default_rng(seed).random((5, 3, 16), dtype=np.float32)
     action = policy.act(observation, STATE)
     assert (np.hypot(*action.T) <= 1 + 1e-12).all()
-    raw = np.clip(Actor(SMALL, lidar, weights)(observation), -1, 1)
+    raw = np.clip(Actor(SMALL, lidar, weights)(observation)[0], -1, 1)
     for a, b in zip(action, raw, strict=True):
         assert abs(a[0] * b[1] - a[1] * b[0]) < 1e-6 and a @ b >= 0  # the same direction
 
@@ -156,6 +157,58 @@ def test_a_decision_is_held_for_its_interval():
         observation, *_ = env.step([[1.0, 0.0], [0.0, 1.0]])
     same = [np.array_equal(a, b) for a, b in itertools.pairwise(actions)]
     assert same == [True, True, False, True, True]
+
+
+def test_chance_is_drawn_anew_after_its_time_in_proportion_to_the_deviation_and_from_the_seed():
+    lidar = Lidar(beams=16, stack=1)
+    weights = random_weights(SMALL, lidar)
+    weights["log_std"][:] = (-2.0, -1.0)
+    for name in ("action.weight", "action.bias"):
+        weights[name] *= 0.1
+    seen = np.random.default_rng(1).random((5, 3, 16), dtype=np.float32)
+    mean, deviation = Actor(SMALL, lidar, weights)(seen)
+
+    def acts(noise, seed, n_steps=7):
+        policy = Policy(spec_of(lidar, noise=noise, noise_steps=3), weights)
+        policy.reset(np.random.default_rng(seed))
+        return np.array([policy.act(seen, STATE.but(step=k)) for k in range(n_steps)])
+
+    added = (acts(0.5, 7) - mean) / deviation
+    same = [np.allclose(a, b) for a, b in itertools.pairwise(added)]
+    assert same == [True, True, False, True, True, False]
+    drawn = 0.5 * np.random.default_rng(7).standard_normal((3, 5, 2))
+    assert added[[0, 3, 6]] == pytest.approx(drawn, abs=1e-4)
+    np.testing.assert_array_equal(acts(0.5, 7), acts(0.5, 7))
+    np.testing.assert_array_equal(acts(0.0, 7), acts(0.0, 8))
+    assert (acts(0.0, 7) == pytest.approx(np.tile(mean, (7, 1, 1)))) and not np.array_equal(acts(0.5, 7), acts(0.5, 8))
+
+
+def test_chance_rest_interval_and_the_goals_frame_go_together():
+    weights = random_weights(SMALL, LIDAR)
+    weights["log_std"][:] = (-1.0, -0.5)
+    for name in ("action.weight", "action.bias"):
+        weights[name] *= 0.4
+    policy = Policy(spec_of(noise=0.5, noise_steps=3, rest=0.4, interval=2), weights)
+    env = ShepherdingEnv("small", rewards={}, lidar=policy.lidar)
+    reference = ShepherdingEnv("small", rewards={}, lidar=LIDAR)  # rolls by itself
+    observation, _ = env.reset(seed=3)
+    seen, _ = reference.reset(seed=3)
+    policy.reset(np.random.default_rng(7))
+    rng, actor, rests = np.random.default_rng(7), Actor(SMALL, LIDAR, weights), []
+    for k in range(18):
+        if k % 3 == 0:
+            chance = 0.5 * rng.standard_normal((len(seen), 2))
+        if k % 2 == 0:
+            mean, deviation = actor(seen)
+            raw = np.clip(mean + chance * deviation, -1, 1)
+            speed = np.linalg.norm(raw, axis=1, keepdims=True)
+            wanted = turn(np.where(speed < 0.4, 0.0, raw / np.maximum(speed, 1)), reference.beam_offset, 64)
+            rests += list(speed < 0.4)
+        action = policy.act(observation, env.state)
+        assert action == pytest.approx(wanted, abs=1e-5)
+        observation, *_ = env.step(action)
+        seen, *_ = reference.step(action)
+    assert any(rests) and not all(rests)
 
 
 def test_less_than_the_least_speed_is_standing_still():
@@ -359,6 +412,7 @@ HOSTILE_FIELDS = {
     "huge layers": {"network": {"kind": "SectorNetwork", "hidden": 10**12}},
     "large layers": {"network": {"kind": "SectorNetwork", "features": 4096, "hidden": 4096, "latent": 4096}},
     "a group that does not divide": {"network": {"kind": "SectorNetwork", "group": 3}},
+    "actions that scatter by what is seen": {"network": {"kind": "SectorNetwork", "scatter": True}},
     "no group": {"network": {"kind": "SectorNetwork", "group": 0}},
     "more overlap than columns": {"network": {"kind": "SectorNetwork", "overlap": 60}},
     "another frame": {"action": {"frame": "world"}},
@@ -375,6 +429,14 @@ def test_hostile_fields_are_one_error(name, policy_path):
     table = json.loads(policy_path.read_text())
     resealed(policy_path, {**table, **HOSTILE_FIELDS[name]})
     refused(policy_path)
+
+
+def test_policies_of_earlier_versions_are_read(policy_path):
+    """They say that actions do not scatter by what is seen."""
+    table = json.loads(policy_path.read_text())
+    table["network"]["scatter"] = False
+    resealed(policy_path, table)
+    assert load_policy(policy_path).spec == spec_of()
 
 
 @pytest.mark.parametrize("name", FIELDS)
@@ -533,7 +595,25 @@ def test_the_command_line_takes_a_policy_file_and_knows_it_by_its_checksum(polic
     assert hashes[0] == hashes[1] != hashes[2]
 
 
+def texts(data):
+    """All texts in plain data."""
+    if isinstance(data, dict | list):
+        return [text for part in (data.values() if isinstance(data, dict) else data) for text in texts(part)]
+    return [data] if isinstance(data, str) else []
+
+
 def test_every_shipped_policy_is_a_controller_and_whole():
+    assert set(POLICIES) == {"any", "collie", "original", "wild"}
     for name in POLICIES:
         assert CONTROLLERS[name] is POLICIES[name]
-        assert POLICIES[name]().checksum
+        policy = POLICIES[name]()
+        assert policy.checksum
+        said = texts(policy.spec.training)
+        assert said and not [text for text in said if "/" in text]  # no path of whoever trained it
+
+
+@pytest.mark.parametrize("name", ["wild", "collie"])
+def test_a_shipped_policy_brings_the_sheep_home(name):
+    """A whole episode on a validation seed."""
+    (row,) = evaluate(POLICIES[name](), partial(ShepherdingEnv, SCENARIOS["paper"]), [trial_seed(10_000, 0)])
+    assert row["in_goal_end"] >= 95.0

@@ -9,7 +9,7 @@ from test_learned import LIDAR, SMALL, random_weights, spec_of
 
 from shepherd_phys.controllers import Policy, load_policy
 from shepherd_phys.controllers.network import Actor, SectorNetwork, input_shape
-from shepherd_phys.controllers.policy_files import PolicyError
+from shepherd_phys.controllers.policy_files import Acting, PolicyError
 from shepherd_phys.envs.rewards import SCHEMES
 from shepherd_phys.envs.team import TeamVecEnv
 from shepherd_phys.learning.export import actor_weights, load_actor, to_policy, to_sb3
@@ -18,7 +18,8 @@ from shepherd_phys.learning.network import TeamPolicy
 from shepherd_phys.learning.ppo import Learner, TrainingError
 from shepherd_phys.learning.preset import PRESETS, CriticNetwork, PPOSettings, Preset, Validation, load_preset
 from shepherd_phys.learning.validation import Validator
-from shepherd_phys.lidar import Lidar
+from shepherd_phys.lidar import CHANNELS, Lidar
+from shepherd_phys.obstacles import Pillar
 from shepherd_phys.scenario import SCENARIOS
 from shepherd_phys.settings import SettingsError
 
@@ -73,10 +74,12 @@ def test_torch_and_numpy_agree(name, tmp_path):
     shape = (50, *input_shape(lidar))
     observation = rng.random(shape, dtype=np.float32) * (rng.random(shape) < rng.random((50, 1, 1)))
     with torch.no_grad():
-        wanted = policy.get_distribution({"lidar": torch.from_numpy(observation)}).mode().numpy()
+        wanted_of = policy.get_distribution({"lidar": torch.from_numpy(observation)})
+        wanted, deviation = wanted_of.mode().numpy(), wanted_of.distribution.stddev.numpy()
     assert np.abs(wanted).max() > 0.1
     exported = to_policy(policy, spec_of(lidar, network), tmp_path / "p.json")
-    assert Actor(network, lidar, exported.weights)(observation) == pytest.approx(wanted, abs=1e-5)
+    means, deviations = Actor(network, lidar, exported.weights)(observation)
+    assert means == pytest.approx(wanted, abs=1e-5) and deviations == pytest.approx(deviation, abs=1e-5)
     back = to_sb3(load_policy(tmp_path / "p.json"), critic_numbers=7)
     action, _ = back.predict({"lidar": observation, "critic": np.zeros((50, 7), np.float32)}, deterministic=True)
     assert action == pytest.approx(np.clip(wanted, -1, 1), abs=1e-6)
@@ -94,6 +97,22 @@ def test_the_actor_sees_its_lidar_alone_and_the_critic_the_world():
         assert not torch.equal(policy.predict_values(observation), policy.predict_values(other))
     actor = set(actor_weights(policy))
     assert actor == set(SMALL.shapes(LIDAR))
+
+
+def test_features_made_together_are_those_made_apart():
+    """Learning cuts the lidar once for actor and critic; stable-baselines3 asks for either alone, too."""
+    policy = policy_of(LIDAR, SMALL.but(overlap=2), critic_numbers=4)
+    observation = {"lidar": torch.rand((3, 6, 16)), "critic": torch.rand((3, 4))}
+    with torch.no_grad():
+        for parameter in policy.parameters():  # the last layers begin near 0, which would hide a difference
+            parameter.add_(0.1 * torch.randn_like(parameter))
+        alone, value = policy.get_distribution(observation), policy.predict_values(observation)
+        actions, values, log_prob = policy(observation)
+        again, log_prob_again, entropy = policy.evaluate_actions(observation, actions)
+    assert torch.equal(values, value) and torch.equal(again, value)
+    assert torch.equal(log_prob, alone.log_prob(actions)) and torch.equal(log_prob_again, log_prob)
+    assert torch.equal(entropy, alone.entropy())
+    assert np.ptp(value.numpy()) > 1e-3
 
 
 def test_actor_and_critic_share_no_weight():
@@ -121,6 +140,27 @@ def test_only_a_model_of_the_right_sizes_becomes_a_policy():
     env.close()
     with pytest.raises(PolicyError, match="of another size"):
         load_actor(policy_of(LIDAR, SMALL), random_weights(SMALL.but(hidden=9), LIDAR))
+    weights = random_weights(SMALL, LIDAR)
+    with pytest.raises(PolicyError, match=r"moon\.weight: is no weight of the network"):
+        load_actor(policy_of(LIDAR, SMALL), {**weights, "moon.weight": weights["log_std"]})
+    with pytest.raises(PolicyError, match="log_std: is missing"):
+        load_actor(policy_of(LIDAR, SMALL), {name: array for name, array in weights.items() if name != "log_std"})
+
+
+def test_state_dependent_exploration_is_refused():
+    env = TeamVecEnv(TINY.scenario, (1,), lidar=LIDAR)
+    with pytest.raises(SettingsError, match=r"^use_sde: .*given: True"):
+        PPO(TeamPolicy, env, use_sde=True, n_steps=4, batch_size=4, policy_kwargs={"network": SMALL})
+    env.close()
+
+
+def test_a_model_whose_weights_have_other_names_is_refused(monkeypatch):
+    policy = policy_of(LIDAR, SMALL)
+    weights = actor_weights(policy)
+    for wrong in ({**weights, "moon.weight": weights["log_std"]}, {"log_std": weights["log_std"]}):
+        monkeypatch.setattr("shepherd_phys.learning.export.actor_weights", lambda _, wrong=wrong: wrong)
+        with pytest.raises(PolicyError, match="is no weight of the network|is missing"):
+            to_policy(policy, spec_of())
 
 
 def test_a_live_model_is_exported_and_goes_on(learner, tmp_path):
@@ -271,6 +311,9 @@ def test_presets_are_read_and_written(tmp_path):
     TINY.to_toml(tmp_path / "p.toml")
     assert load_preset(tmp_path / "p.toml") == TINY
     assert load_preset("fast").but(budget=1) == Preset(budget=1)
+    text = (tmp_path / "p.toml").read_text()
+    (tmp_path / "p.toml").write_text(text.replace("[network]\n", "[network]\nscatter = false\n"))  # earlier versions
+    assert "scatter" in (tmp_path / "p.toml").read_text() and load_preset(tmp_path / "p.toml") == TINY
 
 
 def test_the_papers_preset_is_the_papers():
@@ -288,8 +331,10 @@ def test_a_preset_may_mix_worlds_and_price_effort():
     assert 1 <= drawn.n_flocks <= 3 and drawn.flock == TINY.scenario.flock
     assert preset.scheme()["effort"][0] == -2.0 and preset.scheme()["gathered"][0] == 3.0
     assert set(TINY.scheme()) == set(SCHEMES["wild"])
-    spec = spec_of_preset(TINY.but(rest=0.25))
-    assert (spec.action.rest, spec_of_preset(TINY).action.rest) == (0.25, 0.0) and "rest" not in spec.training
+    spec = spec_of_preset(TINY.but(rest=0.25, noise=0.5))
+    assert spec.action == Acting(frame="goal", rest=0.25, noise=0.5, noise_steps=TINY.decision_interval)
+    assert spec_of_preset(TINY.but(noise=0.0)).action == Acting(frame="goal", noise_steps=TINY.decision_interval)
+    assert not {"rest", "noise"} & set(spec.training)
     far = TINY.but(flock_distance=(4.0, 5.0), uneven=1.0).draw()(np.random.default_rng(0), 0)
     assert far.flock_distance == (4.0, 5.0) and far.flock_sizes is not None and far.n_flocks == TINY.scenario.n_flocks
     assert TINY.but(flock_distance=(4.0, 5.0)).draw() == TINY.scenario.but(flock_distance=(4.0, 5.0))
@@ -301,6 +346,7 @@ def test_a_preset_may_mix_worlds_and_price_effort():
     [
         ("reward = 'wold'", "'wold' is not one of original, any, wild"),
         ("rewards = 'wild'", "rewards: there is no such field"),
+        ("decision_interval = 1001", "decision_interval.*less than or equal to 1000"),
         ("budget = 0", "budget.*greater than or equal to 1"),
         ("team_sizes = []", "team_sizes"),
         ("team_sizes = [0]", "team_sizes"),
@@ -319,6 +365,22 @@ def test_a_preset_may_mix_worlds_and_price_effort():
         ("[scenario]\nshepherds = 0", "scenario.shepherds: there must be one"),
         ("[scenario]\nflock_sizes = [60, 40]", "scenario.flock_sizes: validation has other numbers"),
         ("[scenario]\nn_sheep = 4", "validation.flocks: 5 flocks of 4 sheep cannot be"),
+        ("worlds = 1_000_000_000", "worlds: Input should be less than or equal to 10000 .given: 1000000000.$"),
+        ("team_sizes = [1_000_000_000]", "team_sizes.*less than or equal to 10000"),
+        ("worlds = 10_000\nteam_sizes = [10_000]", "worlds, team_sizes, lidar: .* numbers of frames to remember"),
+        ("[ppo]\nn_steps = 1_000_000_000", "n_steps.*less than or equal to"),
+        (
+            "[ppo]\nn_steps = 1_000_000",
+            "worlds, team_sizes, ppo.n_steps, lidar: .* numbers observed in a rollout; at most",
+        ),
+        ("[scenario]\nn_sheep = 1_000_000_000", "worlds, scenario.n_sheep: 64000000000 sheep; at most"),
+        ("[lidar]\nstack = 1000\nstack_stride = 1000", "lidar: .* numbers of frames to remember; a policy may have"),
+        ("[network]\nhidden = 4096\nfeatures = 4096", "network: .* bytes of weights; a policy may have"),
+        ("[validation]\ntrials = 1_000_000_000", "trials.*less than or equal to"),
+        ("[validation]\ntrials = 1_000_000", "3 points x 1000000 trials: at most 1000000 episodes"),
+        ("checkpoint_rollouts = 10_000_000_000", "checkpoint_rollouts.*less than or equal to"),
+        ("seed = 100_000_000_000_000_000_000", "seed"),
+        ("threads = 1_000_000", "threads.*less than or equal to"),
         ("budget =", "is not a TOML file"),
     ],
 )
@@ -327,6 +389,34 @@ def test_a_wrong_preset_is_one_error(text, said, tmp_path):
     with pytest.raises(SettingsError, match=said) as caught:
         load_preset(tmp_path / "mine.toml")
     assert "mine.toml" in str(caught.value) and "\n" not in str(caught.value)
+
+
+WALLS = "[scenario]\nobstacles = [{kind = 'Pillar', center = [8.0, 0.0], radius = 1.0}]\n"
+THREE = ("sheep", "shepherds", "goal")
+
+
+@pytest.mark.parametrize(
+    ("lidar", "channels"),
+    [("", CHANNELS), ("[lidar]\nsectors = 64", CHANNELS), (f"[lidar]\nsectors = 64\nchannels = {list(THREE)}", THREE)],
+)
+def test_channels_follow_from_the_scenario_unless_they_are_given(lidar, channels, tmp_path):
+    (tmp_path / "mine.toml").write_text(WALLS + lidar)
+    preset = load_preset(tmp_path / "mine.toml")
+    assert preset.lidar.channels == channels and preset.lidar.sectors == 64
+    preset.to_toml(tmp_path / "again.toml")
+    assert load_preset(tmp_path / "again.toml") == preset
+    (tmp_path / "mine.toml").write_text(lidar)
+    assert load_preset(tmp_path / "mine.toml").lidar.channels == THREE
+
+
+def test_channels_follow_from_another_scenario():
+    walled = SCENARIOS["small"].but(obstacles=(Pillar(center=(8.0, 0.0), radius=1.0),))
+    assert Preset(scenario=walled).lidar == Preset().lidar.but(channels=CHANNELS)
+    assert TINY.but(scenario=walled).lidar == LIDAR.but(channels=CHANNELS)
+    assert TINY.but(scenario=walled).but(scenario=TINY.scenario) == TINY
+    assert TINY.but(scenario=walled, lidar=LIDAR).lidar == LIDAR
+    goal_alone = Lidar(channels=("sheep", "goal"), sectors=16)
+    assert TINY.but(lidar=goal_alone).but(scenario=walled).lidar == goal_alone
 
 
 def test_a_preset_that_is_not_there_is_one_error(tmp_path):
@@ -342,3 +432,7 @@ def test_a_policy_that_was_trained_deploys_where_it_was_not(learner):
     assert isinstance(policy, Policy)
     rows = Validator(TINY.but(validation=Validation(flocks=(3,), shepherds=(1, 6), trials=1)))(policy)
     assert [row["n_shepherds"] for row in rows] == [1, 6]
+
+
+def test_the_longest_decision_can_be_exported():
+    assert spec_of_preset(TINY.but(decision_interval=1000)).action.noise_steps == 1000

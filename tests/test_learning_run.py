@@ -2,7 +2,9 @@
 
 import ast
 import csv
+import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -16,7 +18,7 @@ from test_learning import TINY
 from shepherd_phys.controllers import load_policy
 from shepherd_phys.learning import checkpoints, run
 from shepherd_phys.learning.checkpoints import Checkpoint, CheckpointError
-from shepherd_phys.learning.folder import CURVE_COLUMNS, Table, alone, begin
+from shepherd_phys.learning.folder import CURVE_COLUMNS, Table, alone, begin, exported
 from shepherd_phys.learning.preset import Preset, load_preset
 from shepherd_phys.learning.run import train
 from shepherd_phys.learning.validation import Validator
@@ -24,7 +26,7 @@ from shepherd_phys.scripts.train import main as train_main
 from shepherd_phys.settings import SettingsError
 
 # 3 slots x 8 decisions x 5 control steps = 120 a rollout, a few fewer where an episode is cut short; 2 rollouts a
-# checkpoint: three checkpoints
+# checkpoint: 600 is three whole intervals
 PRESET = TINY.but(budget=600)
 
 
@@ -231,8 +233,9 @@ def test_what_a_run_leaves(unbroken):
     assert [path.name for path in (unbroken / "tensorboard").iterdir()]
     curve = rows_of(unbroken / "curve.csv")
     assert [int(row["rollout"]) for row in curve] == list(range(1, len(curve) + 1))
+    assert len(curve) == PRESET.n_rollouts == 6
     steps = [int(row["shepherd_steps"]) for row in curve]
-    assert steps == sorted(steps) and steps[-2] < PRESET.budget <= steps[-1]
+    assert steps == sorted(steps) and 0.9 * 720 <= steps[-1] <= 720
     rewards = [row["episode_reward"] for row in curve]
     assert any(rewards) and all(text == "" or np.isfinite(float(text)) for text in rewards)
     checked = rows_of(unbroken / "validation.csv")
@@ -250,9 +253,142 @@ def test_a_finished_run_is_not_trained_further(unbroken, tmp_path):
     assert after.facts == before.facts
 
 
-def test_nobody_else_trains_in_the_folder(unbroken):
+def test_a_smaller_budget_leaves_a_longer_run_as_it_is(unbroken, tmp_path, monkeypatch):
+    shutil.copytree(unbroken, tmp_path / "run")
+    names = [path.name for path in unbroken.iterdir() if path.suffix in {".csv", ".json", ".safetensors", ".toml"}]
+    monkeypatch.setattr("shepherd_phys.controllers.policy_files.__version__", "99")  # nor does a later version
+    train(tmp_path / "run", preset=PRESET.but(budget=240))
+    train(tmp_path / "run")
+    for name in names:
+        assert (tmp_path / "run" / name).read_bytes() == (unbroken / name).read_bytes(), name
+
+
+def test_a_run_that_ends_sooner_goes_on_as_the_longer_one(unbroken, tmp_path):
+    begin(tmp_path, PRESET)
+    seen = []
+    train(tmp_path, preset=PRESET.but(budget=240), report=seen.append)
+    assert len(rows_of(tmp_path / "curve.csv")) == 2 and {told.length for told in seen} == {240}
+    assert [told.done for told in seen] == [0.5, 1.0, 1.0]  # the last of the validation
+    assert Preset.from_toml(tmp_path / "preset.toml") == PRESET
+    assert load_policy(tmp_path / "policy.json").spec.training["budget"] == PRESET.budget
+    train(tmp_path)
+    assert_same_run(tmp_path, unbroken)
+
+
+@pytest.mark.parametrize(("short", "every"), [(1, 1), (240, 1), (241, 1), (1, 2), (500, 2), (481, 4), (481, 3)])
+def test_a_run_that_is_made_longer_is_the_one_that_was_longer_from_the_start(short, every, tmp_path):
+    """Whether or not the end of the shorter one was a validation's turn."""
+    preset = PRESET.but(budget=900, validation=PRESET.validation.but(every=every, passes=0.001))
+    begin(tmp_path / "long", preset)
+    train(tmp_path / "long")
+    begin(tmp_path / "short", preset.but(budget=short))
+    train(tmp_path / "short")
+    train(tmp_path / "short", preset=preset)
+    assert_same_run(tmp_path / "short", tmp_path / "long")
+    assert sorted(os.listdir(tmp_path / "short")) == sorted(os.listdir(tmp_path / "long"))
+
+
+def test_an_end_within_an_interval_is_gone_back_from(unbroken, tmp_path):
+    """As runs of earlier versions left it."""
+    begin(tmp_path, PRESET.but(budget=480))
+    train(tmp_path)
+    end = checkpoints.load_latest(tmp_path / "checkpoints")
+    odd = Checkpoint(2, {**end.arrays, "returns/moments": np.ones(3)}, {**end.facts, "rollouts": 3})
+    checkpoints.save(tmp_path / "checkpoints", odd)
+    train(tmp_path, preset=PRESET)
+    assert_same_run(tmp_path, unbroken)
+
+
+def test_a_run_whose_way_back_is_gone_is_not_made_longer(tmp_path):
+    preset = PRESET.but(budget=480, validation=PRESET.validation.but(every=9))
+    begin(tmp_path, preset)
+    train(tmp_path)
+    (tmp_path / "checkpoints" / "checkpoint-000001.safetensors").unlink()
+    before = rows_of(tmp_path / "validation.csv")
+    with pytest.raises(CheckpointError, match="the one before, from which a longer run goes on, is not there whole"):
+        train(tmp_path, preset=preset.but(budget=600))
+    assert load_policy(tmp_path / "best.json") and rows_of(tmp_path / "validation.csv") == before
+    assert Preset.from_toml(tmp_path / "preset.toml") == preset
+
+
+def test_a_run_ends_with_whole_intervals_of_its_budget():
+    lengths = [TINY.but(budget=budget).n_rollouts for budget in (1, 239, 240, 241, 600)]
+    assert lengths == [2, 2, 2, 4, 6]
+    assert TINY.but(budget=241, checkpoint_rollouts=1).n_rollouts == 3
+
+
+def test_time_that_is_up_ends_a_run_with_an_interval(tmp_path):
+    begin(tmp_path, PRESET)
+    train(tmp_path, seconds=1e-9)
+    assert [row["rollout"] for row in rows_of(tmp_path / "curve.csv")] == ["1", "2"]
+    train(tmp_path, seconds=1e-9)
+    assert checkpoints.load_latest(tmp_path / "checkpoints").number == 1
+
+
+def test_tensorboard_shows_each_rollout_once(unbroken, tmp_path):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    def shown(folder):
+        events = EventAccumulator(str(folder / "tensorboard"))
+        events.Reload()
+        return {tag: [(e.step, e.value) for e in events.Scalars(tag)] for tag in events.Tags()["scalars"]}
+
+    begin(tmp_path, PRESET)
+    for rollouts in (1, 3, 2):  # the first of these processes dies before there is a checkpoint
+        seen = []
+
+        def report(progress, seen=seen, rollouts=rollouts):
+            seen.append(progress)
+            if sum(not p.validation for p in seen) >= rollouts:
+                raise Killed
+
+        with pytest.raises(Killed):
+            train(tmp_path, report=report)
+    train(tmp_path)
+    curve = rows_of(tmp_path / "curve.csv")
+    whole = shown(tmp_path)
+    assert whole == shown(unbroken)
+    assert "train/n_updates" not in whole  # as stable-baselines3 has it
+    assert [step for step, _ in whole["time/shepherd_steps"]] == [int(row["decisions"]) for row in curve]
+    assert [value for _, value in whole["train/value_loss"]] == pytest.approx(
+        [float(row["value_loss"]) for row in curve]
+    )
+    assert [step for step, _ in whole["validation/score"]] == [int(row["decisions"]) for row in curve[1::2]]
+
+
+def test_nobody_else_trains_in_the_folder(unbroken, tmp_path):
     with alone(unbroken), pytest.raises(SettingsError, match="another process trains in it"):
         train(unbroken)
+    with alone(tmp_path), pytest.raises(SettingsError, match="another process trains in it"):
+        begin(tmp_path, PRESET)
+
+
+def test_while_somebody_trains_the_run_stays_what_it_is(unbroken, capsys):
+    before = (unbroken / "preset.toml").read_bytes()
+    with alone(unbroken):
+        assert train_main(["--resume", "--out", str(unbroken), "--budget", "9000"]) == 2
+    assert "another process trains in it" in capsys.readouterr().err
+    assert (unbroken / "preset.toml").read_bytes() == before
+
+
+@pytest.mark.parametrize("lost", ["policy.json", "policy.safetensors", "best.json", "best.safetensors"])
+def test_a_finished_run_gets_its_policies_back(lost, unbroken, tmp_path):
+    """As when it was killed between its last checkpoint and the export, or within."""
+    shutil.copytree(unbroken, tmp_path / "run")
+    saved = checkpoints.load_latest(unbroken / "checkpoints")
+    assert exported(tmp_path / "run", saved)
+    (tmp_path / "run" / lost).write_bytes((unbroken / lost).read_bytes()[:100])
+    assert not exported(tmp_path / "run", saved)
+    train(tmp_path / "run")
+    assert exported(tmp_path / "run", saved)
+    assert_same_run(tmp_path / "run", unbroken)
+
+
+def test_policies_of_an_earlier_checkpoint_are_not_the_last_ones(unbroken):
+    saved = checkpoints.load_latest(unbroken / "checkpoints")
+    later = Checkpoint(4, saved.arrays, {**saved.facts, "shepherd_steps": saved.facts["shepherd_steps"] + 1})
+    assert exported(unbroken, saved) and not exported(unbroken, later)
+    assert not exported(unbroken, Checkpoint(4, saved.arrays, {**saved.facts, "first": {"shepherd_steps": 1}}))
 
 
 def test_a_folder_holds_one_run(unbroken):
@@ -262,6 +398,8 @@ def test_a_folder_holds_one_run(unbroken):
 
 # --------------------------------------------------------------- checkpoints
 
+OLD_CHECKSUM = "e427344320e76a1b8e08b0f5ac22137c410f7687f150ac8c5f3db735ee2e80b5"
+"""Of the arrays, as an earlier version made it."""
 ARRAYS = {"a": np.arange(6, dtype=np.float32).reshape(2, 3), "b": np.array(1.5), "c": np.zeros((2, 3)).T}
 
 
@@ -286,6 +424,30 @@ def test_a_damaged_checkpoint_gives_way_to_the_one_before(tmp_path):
     first.write_bytes(b"")
     with pytest.raises(CheckpointError, match="checkpoint-000002.safetensors: is not a checkpoint"):
         checkpoints.load_latest(tmp_path)
+
+
+def test_what_a_checkpoint_tells_beside_its_arrays_is_checked_too(tmp_path):
+    path = checkpoints.save(tmp_path, Checkpoint(1, ARRAYS, {"rollouts": 20, "best": {"score": 97.5}}))
+    whole = path.read_bytes()
+    for right, wrong in ((b"20", b"21"), (b"97.5", b"99.5"), (b"rollouts", b"rollouds")):
+        assert whole.count(right) == 1
+        path.write_bytes(whole.replace(right, wrong))
+        with pytest.raises(CheckpointError, match="is damaged"):
+            checkpoints.load(path)
+
+
+def test_checkpoints_of_earlier_versions_are_read(tmp_path):
+    """Their checksum is of the arrays alone."""
+    path = checkpoints.save(tmp_path, Checkpoint(7, ARRAYS, {}))
+    arrays = checkpoints.load(path).arrays
+    table = {"number": 7, "facts": {"rollouts": 140}, "sha256": OLD_CHECKSUM}
+    safetensors.numpy.save_file(dict(arrays), path, metadata={"checkpoint": json.dumps(table)})
+    read = checkpoints.load_latest(tmp_path)
+    assert (read.number, read.facts) == (7, {"rollouts": 140})
+    table["sha256"] = OLD_CHECKSUM[::-1]
+    safetensors.numpy.save_file(dict(arrays), path, metadata={"checkpoint": json.dumps(table)})
+    with pytest.raises(CheckpointError, match="is damaged"):
+        checkpoints.load(path)
 
 
 def test_files_that_are_no_checkpoints_are_left_alone(tmp_path):
@@ -355,7 +517,7 @@ def test_the_command_trains_resumes_and_evaluates(tmp_path):
     assert run.returncode == 2 and "--resume continues it" in run.stderr
     run = shepherd_phys("train", "--resume", "--out", str(folder), "--budget", "500", "--workers", "1", cwd=tmp_path)
     assert run.returncode == 0, run.stderr
-    assert int(rows_of(tmp_path / folder / "curve.csv")[-1]["shepherd_steps"]) >= 500
+    assert len(rows_of(tmp_path / folder / "curve.csv")) == TINY.but(budget=500).n_rollouts == 6
     run = shepherd_phys("train", "--resume", "--out", str(folder), "--reward", "any", cwd=tmp_path)
     assert run.returncode == 2 and "other settings" in run.stderr
     command = ("evaluate", "--controllers", str(folder / "best.json"), "--scenario", "small")

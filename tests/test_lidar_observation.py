@@ -157,3 +157,10 @@ def test_actions_are_turned_back_by_the_same_angle():
     turned = turn(action, np.array([0, 4, 8]), 16)
     assert turned == pytest.approx(np.array([[1.0, 0.0], [0.0, 1.0], [0.0, -0.5]]))
     assert turn(action.astype(np.float32), np.array([0, 4, 8]), 16).dtype == np.float32
+
+
+@pytest.mark.parametrize("offset", [np.array([5]), np.arange(4), np.array(5), np.array([[5]] * 3)])
+@pytest.mark.parametrize("shape", [(3, 2), (3, 1), (2,), (3, 2, 1)])
+def test_a_turn_needs_as_many_offsets_as_vectors(shape, offset):
+    with pytest.raises(ValueError, match=r"^action: needs the shape \(P, 2\)"):
+        turn(np.ones(shape), offset, 16)

@@ -16,13 +16,15 @@ from shepherd_phys.controllers.curves import COLUMNS
 from shepherd_phys.learning import studies
 from shepherd_phys.learning.studies import Run
 from shepherd_phys.scripts import main, reproduce, train
-from shepherd_phys.scripts.curves import VALIDATIONS, read_rows
+from shepherd_phys.scripts.curves import VALIDATIONS, one_by_one, read_rows
 from shepherd_phys.scripts.learning_pages import ablations_page, figure1_page
-from shepherd_phys.scripts.studies import HOME_COLUMNS
+from shepherd_phys.scripts.studies import HOME_COLUMNS, Reported
+from shepherd_phys.scripts.studies import figure1 as study
 
 pytest.importorskip("matplotlib")
 
-# 3 slots x 8 decisions x 5 control steps = 120 shepherd-steps a rollout, two rollouts a checkpoint
+# 3 slots x 8 decisions x 5 control steps = 120 shepherd-steps a rollout, fewer where an episode ends; two rollouts a
+# checkpoint
 QUICK = TINY.but(scenario=TINY.scenario.but(n_steps=30), checkpoint_rollouts=2)
 JUDGED = QUICK.validation.but(flocks=(1, 2), passes=0.1)
 
@@ -31,7 +33,7 @@ def runs(n_seeds, budget, paper_hours=0.0):
     """Runs of wild and any and one of a paper's recipe, as `shepherd_phys.learning.studies.figure1` makes them."""
     fast = QUICK.but(budget=budget, validation=JUDGED)
     made = [
-        Run(f"{reward}-{k}", "fast", fast.but(reward=reward, seed=k))
+        Run(f"{reward}-{k}", "fast", fast.but(reward=reward, seed=k), timed=reward == "wild" and k < 1)
         for reward in ("wild", "any")
         for k in range(n_seeds)
     ]
@@ -78,12 +80,12 @@ def test_figure_1_from_nothing_and_again(folder, capsys, monkeypatch):
     for reward in ("wild", "any"):
         own = [row for row in curves if row["reward"] == reward]
         last = read(f"training/{reward}-0/curve.csv")[-1]
-        assert own[-1]["shepherd_steps"] == int(last["shepherd_steps"]) >= 480
+        assert own[-1]["shepherd_steps"] == int(last["shepherd_steps"]) and int(last["rollout"]) == 4
         assert own[-1]["decisions"] == int(last["decisions"]) and own[-1]["seconds"] == float(last["seconds"])
         assert all(row["episode_reward"] is not None for row in own[:-1])
     checks = read_rows(Path("o/figure1-validation.csv"), VALIDATIONS)
     assert [(row["checkpoint"], row["n_flocks"]) for row in checks if row["reward"] == "wild"] == [
-        (1, 1), (1, 2), (2, 1), (2, 2), (3, 1), (3, 2),
+        (1, 1), (1, 2), (2, 1), (2, 2),
     ]  # fmt: skip
     home = read_rows(Path("o/time-to-home.csv"), HOME_COLUMNS)
     assert [(row["seed"], row["checkpoint"], row["n_flocks"], row["trials"]) for row in home] == [
@@ -125,14 +127,67 @@ def test_figure_1_goes_on_after_a_stop_and_becomes_longer(folder, capsys, monkey
     short = read_rows(Path("o/figure1.csv"), COLUMNS)
     first = load_policy("o/training/wild-0/first.json").checksum
     assert {row["recipe"] for row in short} == {"fast", "paper"}
-    assert len(read("training/paper-wild-7/curve.csv")) == 1  # its time was over at once
+    assert len(read("training/paper-wild-7/curve.csv")) == 2  # its time was over at once
     assert [row["checkpoint"] for row in read("training/paper-wild-7/validation.csv")] == ["1", "1"]
     assert figure1(budget=480) == 0
-    assert max(row["shepherd_steps"] for row in read_rows(Path("o/figure1.csv"), COLUMNS)) >= 480
+    assert max(row["rollout"] for row in read_rows(Path("o/figure1.csv"), COLUMNS)) == 4
     assert load_policy("o/training/wild-0/first.json").checksum == first  # the first stays the first
     assert load_policy("o/training/wild-0/policy.json").checksum != first
     assert figure1("--paper-hours", "1e-9", budget=240) == 0  # and a shorter look at the longer runs
     assert read_rows(Path("o/figure1.csv"), COLUMNS) == short
+
+
+def test_timed_runs_are_trained_alone_and_the_others_side_by_side(folder, monkeypatch, capsys):
+    told = []
+
+    def watched(how):
+        def train_them(runs, training, workers):
+            told.append((how, [run.name for run in runs], workers))
+            return one_by_one(runs, training, 1)
+
+        return train_them
+
+    for how in ("one_by_one", "side_by_side"):
+        monkeypatch.setattr(f"shepherd_phys.scripts.studies.{how}", watched(how))
+    reported = Reported("tiny.toml", 1, 20_000, 0, 60.0)
+    result = study(Path("o"), n_seeds=2, budget=120, paper_hours=1e-9, workers=3, reported=reported)
+    beside = ["wild-1", "any-0", "any-1", "paper-wild-7"]
+    assert told == [("one_by_one", ["wild-0"], 3), ("side_by_side", beside, 3)]
+    assert {row["seed"] for row in result.tables["time_to_home"]} == {0}
+    schemes = dict.fromkeys((row["recipe"], row["reward"]) for row in read_rows(Path("o/figure1.csv"), COLUMNS))
+    assert list(schemes) == [("fast", "wild"), ("fast", "any"), ("paper", "wild")]
+
+
+def test_what_an_interrupted_study_has_is_enough_for_fewer_seeds(folder, monkeypatch, capsys):
+    def stop(now):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            "shepherd_phys.scripts.curves._teller", lambda name: stop if name == "any-1" else lambda now: None
+        )
+        assert figure1("--seeds", "2", budget=120) == 130
+    assert sorted(path.name for path in Path("o/training").iterdir()) == ["any-0", "any-1", "wild-0", "wild-1"]
+    monkeypatch.setattr("shepherd_phys.scripts.curves._train", None)  # nothing is left to be trained
+    assert figure1(budget=120) == 0
+    assert {row["seed"] for row in read("figure1.csv")} == {"0"}
+    assert "| fast | any | 1 |" in Path("o/figure1.md").read_text("utf-8")
+
+
+def test_policies_that_a_kill_left_out_are_written_again(folder, monkeypatch, capsys):
+    assert figure1(budget=120) == 0
+    before = {path: path.read_bytes() for path in Path("o/training").rglob("*.json")}
+    assert {path.name for path in before} == {"policy.json", "best.json", "first.json"}
+    curve = Path("o/training/any-0/curve.csv").read_bytes()
+    Path("o/training/any-0/policy.json").unlink()
+    Path("o/training/any-0/best.safetensors").write_bytes(b"torn")
+    Path("o/training/wild-0/first.safetensors").unlink()
+    capsys.readouterr()
+    assert figure1(budget=120) == 0
+    assert {path: path.read_bytes() for path in Path("o/training").rglob("*.json")} == before
+    for path in before:
+        load_policy(path)
+    assert Path("o/training/any-0/curve.csv").read_bytes() == curve
 
 
 def test_a_folder_with_other_settings_is_left_alone(folder, capsys):

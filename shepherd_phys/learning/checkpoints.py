@@ -46,27 +46,34 @@ def save(folder: Path, checkpoint: Checkpoint) -> Path:
     """
     path = folder / f"checkpoint-{checkpoint.number:06d}.safetensors"
     arrays = {name: np.ascontiguousarray(array) for name, array in checkpoint.arrays.items()}
-    facts = {"number": checkpoint.number, "facts": checkpoint.facts, "sha256": _digest(arrays)}
+    table = {"number": checkpoint.number, "facts": dict(checkpoint.facts)}
+    table["checksum"] = _checksum(arrays, table)
     try:
-        blob = safetensors.numpy.save(arrays, metadata={"checkpoint": json.dumps(facts, allow_nan=False)})
+        blob = safetensors.numpy.save(arrays, metadata={"checkpoint": json.dumps(table, allow_nan=False)})
         folder.mkdir(parents=True, exist_ok=True)
         with whole_file(path) as part:
             part.write_bytes(blob)
-        for old in _paths(folder)[:-KEPT]:
+        for _, old in _numbered(folder)[:-KEPT]:
             old.unlink()
     except OSError as error:
         raise CheckpointError(f"{path}: cannot be written ({error.strerror})") from None
     return path
 
 
-def load_latest(folder: Path) -> Checkpoint | None:
+def load_latest(folder: Path, before: int | None = None) -> Checkpoint | None:
     """The newest checkpoint that is whole; None where there is none.
+
+    Args:
+        folder: of the checkpoints.
+        before: number of the first that is too new; None: none is.
 
     Raises:
         CheckpointError: there are some, and none can be read.
     """
     problem: CheckpointError | None = None
-    for path in reversed(_paths(folder)):
+    for number, path in reversed(_numbered(folder)):
+        if before is not None and number >= before:
+            continue
         try:
             return load(path)
         except CheckpointError as error:
@@ -86,26 +93,31 @@ def load(path: Path) -> Checkpoint:
         with safetensors.safe_open(path, framework="np") as file:
             table = json.loads((file.metadata() or {})["checkpoint"])
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (it is no mapping)
-        number, facts, digest = int(table["number"]), dict(table["facts"]), table["sha256"]
+        number, facts = int(table["number"]), dict(table["facts"])
+        # what was written before there was a checksum of everything has one of the arrays alone
+        whole = {"number": table["number"], "facts": facts} if "checksum" in table else None
+        digest = table["sha256"] if whole is None else table["checksum"]
     except OSError as error:
         raise CheckpointError(f"{path}: cannot be read ({error})") from None
     except (safetensors.SafetensorError, KeyError, TypeError, ValueError) as error:
         raise CheckpointError(f"{path}: is not a checkpoint ({' '.join(str(error).split())})") from None
-    if digest != _digest(arrays):
+    if digest != _checksum(arrays, whole):
         raise CheckpointError(f"{path}: is damaged (its checksum is wrong)")
     return Checkpoint(number, arrays, facts)
 
 
-def _paths(folder: Path) -> list[Path]:
-    """The checkpoints in a folder, oldest first."""
+def _numbered(folder: Path) -> list[tuple[int, Path]]:
+    """The checkpoints in a folder with their numbers, oldest first."""
     if not folder.is_dir():
         return []
-    found = [(int(match[1]), path) for path in folder.iterdir() if (match := NAME.fullmatch(path.name))]
-    return [path for _, path in sorted(found)]
+    return sorted((int(match[1]), path) for path in folder.iterdir() if (match := NAME.fullmatch(path.name)))
 
 
-def _digest(arrays: Mapping[str, Array]) -> str:
+def _checksum(arrays: Mapping[str, Array], table: Mapping[str, Any] | None) -> str:
+    """SHA-256 of the arrays and, where it is given, of what is told beside them."""
     total = hashlib.sha256()
+    if table is not None:
+        total.update(f"{json.dumps(table, sort_keys=True)}\n".encode())
     for name in sorted(arrays):
         total.update(f"{name} {arrays[name].dtype} {arrays[name].shape}\n".encode())
         total.update(np.ascontiguousarray(arrays[name]).tobytes())

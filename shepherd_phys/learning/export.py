@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from torch import nn
 
 from shepherd_phys.controllers.learned import Policy
 from shepherd_phys.controllers.network import input_shape
-from shepherd_phys.controllers.policy_files import Acting, PolicyError, PolicySpec, write_policy
+from shepherd_phys.controllers.policy_files import PolicyError, PolicySpec, write_policy
 from shepherd_phys.learning.network import SectorFeatures, TeamPolicy
 from shepherd_phys.learning.preset import CriticNetwork, Preset
 from shepherd_phys.settings import tagged
@@ -23,7 +24,7 @@ from shepherd_phys.settings import tagged
 def spec_of(preset: Preset, shepherd_steps: int = 0) -> PolicySpec:
     """What the file of a policy trained by ``preset`` says beside its weights."""
     training = preset.to_dict()
-    for name in ("scenario", "lidar", "network", "reward", "effort", "alpha", "credit", "rest"):
+    for name in ("scenario", "lidar", "network", "reward", "effort", "alpha", "credit", "rest", "noise"):
         training.pop(name, None)
     if preset.init is not None:
         training["init"] = Path(preset.init).name  # where it lay is nobody's business
@@ -36,7 +37,7 @@ def spec_of(preset: Preset, shepherd_steps: int = 0) -> PolicySpec:
         scenario=preset.scenario,
         lidar=preset.lidar,
         network=preset.network,
-        action=Acting(frame=preset.lidar.frame, rest=preset.rest),
+        action=preset.acting(),
         rewards=rewards,
         training={**training, "algorithm": "PPO of stable-baselines3", "shepherd_steps": shepherd_steps},
     )
@@ -51,11 +52,12 @@ def load_actor(policy: TeamPolicy, weights: dict[str, NDArray[np.float32]]) -> N
     """Put a policy's weights into the actor.
 
     Raises:
-        PolicyError: the network has other sizes.
+        PolicyError: the network has other weights, or of other sizes.
     """
     actor = _actor(policy)
+    _check_names(actor, weights)
     for name, parameter in actor.items():
-        if name not in weights or tuple(parameter.shape) != weights[name].shape:
+        if tuple(parameter.shape) != weights[name].shape:
             raise PolicyError(f"{name}: the network needs {tuple(parameter.shape)}; the policy's is of another size")
     with torch.no_grad():
         for name, parameter in actor.items():
@@ -77,7 +79,9 @@ def to_policy(model: BaseAlgorithm | TeamPolicy, spec: PolicySpec, path: str | P
     if not isinstance(policy, TeamPolicy):
         raise PolicyError(f"only a TeamPolicy can become a policy file (given: {type(policy).__name__})")
     weights = actor_weights(policy)
-    for name, shape in spec.network.shapes(spec.lidar).items():
+    shapes = spec.network.shapes(spec.lidar)
+    _check_names(shapes, weights)
+    for name, shape in shapes.items():
         if weights[name].shape != shape:
             raise PolicyError(f"{name}: the spec tells {shape}, the model has {weights[name].shape}")
     checksum = write_policy(path, spec, weights) if path is not None else ""
@@ -120,4 +124,11 @@ def _actor(policy: TeamPolicy) -> dict[str, nn.Parameter]:
         "action": policy.action_net,
     }
     named = {f"{name}.{part}": getattr(layer, part) for name, layer in layers.items() for part in ("weight", "bias")}
-    return {**named, "log_std": policy.log_std}
+    named["log_std"] = policy.log_std
+    return named
+
+
+def _check_names(wanted: Collection[str], given: Collection[str]) -> None:
+    """Refuse other weights than those wanted."""
+    for name in sorted(set(wanted) ^ set(given)):
+        raise PolicyError(f"{name}: {'is missing' if name in wanted else 'is no weight of the network'}")

@@ -10,7 +10,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from shepherd_phys.controllers.learned import load_policy
+from shepherd_phys.controllers.policy_files import PolicyError
 from shepherd_phys.files import whole_file
+from shepherd_phys.learning.checkpoints import Checkpoint
 from shepherd_phys.learning.preset import Preset
 from shepherd_phys.settings import SettingsError
 
@@ -43,13 +46,19 @@ def begin(folder: Path, preset: Preset) -> None:
     Raises:
         SettingsError: it holds a run already, or cannot be made.
     """
-    if (folder / PRESET).exists():
-        raise SettingsError(f"{folder} holds a run: --resume continues it; another run needs another folder")
+    _refuse_a_run(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise SettingsError(f"{folder}: cannot be made ({error.strerror})") from None
-    preset.to_toml(folder / PRESET)
+    with alone(folder):
+        _refuse_a_run(folder)  # somebody else may have begun one just now
+        preset.to_toml(folder / PRESET)
+
+
+def _refuse_a_run(folder: Path) -> None:
+    if (folder / PRESET).exists():
+        raise SettingsError(f"{folder} holds a run: --resume continues it; another run needs another folder")
 
 
 def agree(folder: Path, preset: Preset) -> Preset:
@@ -88,6 +97,29 @@ def alone(folder: Path) -> Iterator[None]:
         yield
     finally:
         lock.close()
+
+
+def ended(saved: Checkpoint, n_rollouts: int, seconds: float = math.inf) -> bool:
+    """Whether a run needs no further training: so many rollouts are done, or so many seconds of it."""
+    return bool(saved.facts["rollouts"] >= n_rollouts or saved.facts["seconds"] >= seconds)
+
+
+def is_policy_of(path: Path, **training: int) -> bool:
+    """Whether a whole policy lies there that was trained so: a kill may have come before, or in the middle."""
+    try:
+        told = load_policy(path).spec.training
+    except PolicyError:
+        return False
+    return all(told.get(name) == value for name, value in training.items())
+
+
+def exported(folder: Path, saved: Checkpoint) -> bool:
+    """Whether the policy files are those of a checkpoint."""
+    wanted = {POLICY: saved.facts["shepherd_steps"]}
+    for file in (BEST, FIRST):
+        if Path(file).stem in saved.facts:
+            wanted[file] = saved.facts[Path(file).stem]["shepherd_steps"]
+    return all(is_policy_of(folder / file, shepherd_steps=steps) for file, steps in wanted.items())
 
 
 class Table:

@@ -12,6 +12,7 @@ from torch import nn
 
 from shepherd_phys.controllers.network import SectorNetwork
 from shepherd_phys.learning.preset import CriticNetwork
+from shepherd_phys.settings import SettingsError
 
 
 class SectorFeatures(BaseFeaturesExtractor):
@@ -39,12 +40,18 @@ class SectorFeatures(BaseFeaturesExtractor):
 
     def forward(self, observations: dict[str, torch.Tensor]) -> torch.Tensor:
         """(B, hidden)."""
-        lidar = observations["lidar"]
+        return self.of_groups(self.cut(observations["lidar"]), observations)
+
+    def cut(self, lidar: torch.Tensor) -> torch.Tensor:
+        """The groups (B, G, R x (group + 2 overlap)) of an observation (B, R, C): what the shared layer sees."""
         batch, rows, _ = lidar.shape
         if self._overlap:
             lidar = torch.cat((lidar[..., -self._overlap :], lidar, lidar[..., : self._overlap]), dim=-1)
         groups = lidar.unfold(2, self._group + 2 * self._overlap, self._group)  # (B, R, G, group + 2 overlap)
-        seen = groups.transpose(1, 2).reshape(batch, groups.shape[2], rows * groups.shape[3])
+        return groups.transpose(1, 2).reshape(batch, groups.shape[2], rows * groups.shape[3])
+
+    def of_groups(self, seen: torch.Tensor, observations: dict[str, torch.Tensor]) -> torch.Tensor:
+        """(B, hidden) of groups that are cut already."""
         joined = torch.relu(self.groups(seen)).flatten(1)
         if self.world is not None:
             joined = torch.cat((joined, torch.relu(self.world(observations["critic"]))), dim=1)
@@ -61,6 +68,9 @@ class TeamPolicy(MultiInputActorCriticPolicy):
         network: sizes of the actor.
         critic: sizes of the critic; of both, none given: the default ones.
         options: further ones of stable-baselines3's policies, such as ``log_std_init``.
+
+    Raises:
+        SettingsError: ``use_sde`` is asked for: its standard deviations are no two numbers, and no policy file's.
     """
 
     def __init__(
@@ -72,6 +82,8 @@ class TeamPolicy(MultiInputActorCriticPolicy):
         critic: CriticNetwork | None = None,
         **options: Any,
     ) -> None:
+        if options.get("use_sde"):
+            raise SettingsError("use_sde: a TeamPolicy explores without it (given: True)")
         self.network, self.critic = network or SectorNetwork(), critic or CriticNetwork()
         super().__init__(
             observation_space,
@@ -90,6 +102,15 @@ class TeamPolicy(MultiInputActorCriticPolicy):
             return SectorFeatures(space, self.network, self.network.hidden)
         world = self.critic.world if "critic" in space.spaces else 0
         return SectorFeatures(space, self.network, self.critic.hidden, world)
+
+    def extract_features(  # type: ignore[override]
+        self, obs: Any, features_extractor: BaseFeaturesExtractor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """The actor's and the critic's. Both cut the lidar alike: once for both, since that copies the observations."""
+        actor, critic = self.pi_features_extractor, self.vf_features_extractor
+        assert isinstance(actor, SectorFeatures) and isinstance(critic, SectorFeatures)
+        seen = actor.cut(obs["lidar"])
+        return actor.of_groups(seen, obs), critic.of_groups(seen, obs)
 
     def _build_mlp_extractor(self) -> None:
         heads = MlpExtractor(self.network.hidden, {"pi": [self.network.latent], "vf": []}, nn.Tanh, self.device)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Mapping
 from typing import Any
@@ -130,7 +131,8 @@ class Learner:
         watch = _Watch()
         n = self.env.num_envs * model.n_steps
         try:
-            model.learn(n, callback=watch, reset_num_timesteps=False)
+            # who logs has more to tell of a rollout when it has been learned from: nothing is dumped in here
+            model.learn(n, callback=watch, reset_num_timesteps=False, log_interval=sys.maxsize)
         except ValueError as error:  # torch's distributions refuse a NaN before anybody else sees it
             self._check_parameters()
             raise TrainingError(f"learning failed: {' '.join(str(error).split())[:300]}") from error

@@ -2,29 +2,40 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field
 
 from shepherd_phys.controllers.learned import POLICIES, Policy, load_policy
-from shepherd_phys.controllers.network import SectorNetwork
+from shepherd_phys.controllers.network import SectorNetwork, input_shape, without_scatter
+from shepherd_phys.controllers.policy_files import MAX_FRAMES, MAX_WEIGHTS, Acting
 from shepherd_phys.envs.mixture import Mixture
 from shepherd_phys.envs.rewards import SCHEMES, Effort, Gathered, Occlusion, Term
-from shepherd_phys.lidar import Lidar
+from shepherd_phys.lidar import CHANNELS, Lidar
 from shepherd_phys.scenario import SCENARIOS, Scenario
 from shepherd_phys.settings import Settings, SettingsError, read_toml, settings, write_toml
 
 FOLDER = Path(__file__).parent / "presets"
+MOST_NUMBERS = 2**32
+"""Of all observations in a rollout: 16 GiB."""
+MOST_FRAMES = 2**32
+"""Numbers of frames that all shepherds' lidars remember: 16 GiB."""
+MOST_SHEEP = 10_000_000
+"""In all worlds."""
+MOST_EPISODES = 1_000_000
+"""Of a validation."""
 
 
 def _listed(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
-Count = Annotated[int, Field(ge=1)]
-Counts = Annotated[tuple[Count, ...], Field(min_length=1), BeforeValidator(_listed)]
+# bounds are far above what anybody trains, and below what no machine holds: a slip costs an error, not the memory
+Count = Annotated[int, Field(ge=1, le=10_000)]
+Counts = Annotated[tuple[Count, ...], Field(min_length=1, max_length=10_000), BeforeValidator(_listed)]
 Range = Annotated[tuple[Count, Count], BeforeValidator(_listed)]
 Length = Annotated[float, Field(ge=0)]
 Span = Annotated[tuple[Length, Length], BeforeValidator(_listed)]
@@ -46,11 +57,11 @@ class CriticNetwork(Settings):
 class PPOSettings(Settings):
     """Of stable-baselines3's PPO, under its names; counts are of decisions."""
 
-    n_steps: int = Field(default=50, ge=1)
+    n_steps: int = Field(default=50, ge=1, le=1_000_000)
     """Decisions of each shepherd in a rollout."""
     batch_size: int = Field(default=2400, ge=2)
     """Decisions in a minibatch."""
-    n_epochs: int = Field(default=4, ge=1)
+    n_epochs: int = Field(default=4, ge=1, le=10_000)
     """Passes over a rollout."""
     learning_rate: float = Field(default=3e-4, gt=0)
     """Of Adam."""
@@ -72,15 +83,15 @@ class PPOSettings(Settings):
     """Logarithm of the exploration's standard deviation at the start."""
     last_log_std: float | None = Field(default=None, ge=-5, le=1)
     """That logarithm may be no more than a line from ``log_std_init`` to this one, whatever is learned: a policy acts
-    without exploration when it is deployed, and must learn to get out of where only exploration got it out. None: no
-    such line."""
-    last_log_std_at: int = Field(default=4_000_000, ge=1)
+    with little or none of it when it is deployed, and must learn to get out of where only exploration got it out. None:
+    no such line."""
+    last_log_std_at: int = Field(default=4_000_000, ge=1, le=10**15)
     """Shepherd-steps at which the line reaches ``last_log_std``, where it stays."""
 
 
 @settings
 class Validation(Settings):
-    """How policies are judged during training: deterministic, deployed by numpy, on seeds of their own."""
+    """How policies are judged during training: as they are deployed, by numpy, on seeds of their own."""
 
     flocks: Counts = (1, 2, 5)
     """Numbers of flocks; every combination of the three lists is a point."""
@@ -88,16 +99,26 @@ class Validation(Settings):
     """Neighbours n that attract a sheep."""
     shepherds: Counts = (3,)
     """Team sizes."""
-    trials: int = Field(default=4, ge=1)
+    trials: int = Field(default=4, ge=1, le=MOST_EPISODES)
     """Episodes a point."""
     seed: int = Field(default=10_000, ge=10_000, le=19_999)
     """Root seed; trial i has the seed that `shepherd-phys evaluate --seed` gives it."""
-    every: int = Field(default=1, ge=1)
-    """Checkpoints from one validation to the next."""
+    every: int = Field(default=1, ge=1, le=10**9)
+    """Checkpoints from one validation to the next. The end of a run is validated whatever its number."""
     passes: float | None = Field(default=None, gt=0, le=100)
     """Sheep delivered that every point must reach [%]: the first policy for which all do is kept; none: no such."""
     path_cost: float = Field(default=0.0, ge=0)
     """What a metre walked takes off the sheep delivered when the best policy is chosen [% / m]."""
+
+    def __post_init__(self) -> None:
+        points = len(self.flocks) * len(self.cohesion) * len(self.shepherds)
+        if points * self.trials > MOST_EPISODES:
+            raise ValueError(f"{points} points x {self.trials} trials: at most {MOST_EPISODES} episodes a validation")
+
+
+def channels_for(scenario: Scenario) -> tuple[Any, ...]:
+    """What shepherds observe there unless somebody says otherwise: obstacles where there are some."""
+    return CHANNELS if scenario.obstacles else CHANNELS[:3]
 
 
 @settings
@@ -116,16 +137,19 @@ class Preset(Settings):
     """Least useful distance of the occlusion term [m]; none: the scheme's."""
     rest: float = Field(default=0.0, ge=0, lt=1)
     """Of the policy when it is deployed, and validated: wanted speeds below this part of the top speed mean standing
-    still. Learning does not know of it."""
+    still. Not while learning: whoever wants to stand still and tries little beside could learn nothing else."""
+    noise: float = Field(default=0.3, ge=0, le=1)
+    """Of the policy when it is deployed, and validated: standard deviations by which its actions scatter about their
+    mean, each for as long as a decision while learning; see `shepherd_phys.controllers.policy_files.Acting`."""
     credit: Literal["own", "team"] = "own"
     """Who is paid for a term that has shares: each shepherd by its own, or all by the mean."""
-    decision_interval: int = Field(default=5, ge=1)
+    decision_interval: int = Field(default=5, ge=1, le=1000)
     """Control steps for which a decision is held while learning."""
-    budget: int = Field(default=6_000_000, ge=1)
-    """Shepherd-steps of the run."""
-    seed: int = Field(default=1_000_000, ge=0)
+    budget: int = Field(default=6_000_000, ge=1, le=10**15)
+    """Shepherd-steps of the run, which ends with a whole checkpoint interval; see `n_rollouts`."""
+    seed: int = Field(default=1_000_000, ge=0, le=2**63 - 1)
     """Root of everything random."""
-    worlds: int = Field(default=64, ge=1)
+    worlds: int = Field(default=64, ge=1, le=10_000)
     """Worlds that run side by side."""
     team_sizes: Counts = (3,)
     """Shepherds of the worlds, in turn."""
@@ -139,16 +163,21 @@ class Preset(Settings):
     """Fraction of the episodes whose flocks differ in size."""
     init: str | None = None
     """Policy to start from: a shipped one's name, or a .json file."""
-    critic_first: int = Field(default=0, ge=0)
+    critic_first: int = Field(default=0, ge=0, le=10**9)
     """Rollouts in which only the critic learns: a fresh one would spoil the policy given as ``init``."""
     critic_sees: Literal["world", "own"] = "world"
     """The whole world, or what the actor sees."""
-    checkpoint_rollouts: int = Field(default=20, ge=1)
+    checkpoint_rollouts: int = Field(default=20, ge=1, le=10**9)
     """Rollouts from one checkpoint to the next. At each all worlds begin anew."""
-    threads: int = Field(default=1, ge=1)
+    threads: int = Field(default=1, ge=1, le=1024)
     """Of torch. With one, a resumed run equals the unbroken one bit for bit."""
     scenario: Scenario = Scenario()
-    lidar: Lidar = Lidar(sectors=64, frame="goal")
+    lidar: Lidar = Field(
+        default_factory=lambda given: Lidar(
+            channels=channels_for(given.get("scenario", Scenario())), sectors=64, frame="goal"
+        )
+    )
+    """Its channels follow from the scenario where nobody gives them."""
     network: SectorNetwork = SectorNetwork()
     critic: CriticNetwork = CriticNetwork()
     ppo: PPOSettings = PPOSettings()
@@ -168,10 +197,12 @@ class Preset(Settings):
                 f"validation.flocks: {max(self.validation.flocks)} flocks of {self.scenario.n_sheep} sheep cannot be"
             )
         try:
-            self.network.shapes(self.lidar)
+            shapes = self.network.shapes(self.lidar)
             self.draw()
+            self.acting()  # what no policy file can say is refused before anything is learned
         except SettingsError as error:
             raise ValueError(str(error)) from None
+        self._check_size(4 * sum(math.prod(shape) for shape in shapes.values()))
         if self.ppo.batch_size > self.n_slots * self.ppo.n_steps:
             raise ValueError(
                 f"ppo.batch_size: {self.ppo.batch_size} is more than a rollout holds: "
@@ -179,6 +210,39 @@ class Preset(Settings):
             )
         if self.init is None and self.critic_first:
             raise ValueError("critic_first: makes sense only with init")
+
+    def _check_size(self, weights: int) -> None:
+        """Refuse what no memory holds, before anything is made, and policies that nobody could read."""
+        lidar = self.lidar
+        if weights > MAX_WEIGHTS:
+            raise ValueError(f"network: {weights} bytes of weights; a policy may have {MAX_WEIGHTS}")
+        frames = ((lidar.stack - 1) * lidar.stack_stride + 1) * len(lidar.channels) * lidar.beams
+        if frames > MAX_FRAMES:
+            raise ValueError(f"lidar: {frames} numbers of frames to remember; a policy may have {MAX_FRAMES}")
+        bounds = {
+            "worlds, scenario.n_sheep": (self.worlds * self.scenario.n_sheep, "sheep", MOST_SHEEP),
+            "worlds, team_sizes, lidar": (self.n_slots * frames, "numbers of frames to remember", MOST_FRAMES),
+            "worlds, team_sizes, ppo.n_steps, lidar": (
+                self.n_slots * self.ppo.n_steps * math.prod(input_shape(lidar)),
+                "numbers observed in a rollout",
+                MOST_NUMBERS,
+            ),
+        }
+        for fields, (number, what, most) in bounds.items():
+            if number > most:
+                raise ValueError(f"{fields}: {number} {what}; at most {most}")
+
+    def but(self, **changes: Any) -> Self:
+        """A validated copy with ``changes``; channels that followed from the scenario follow from another one, too.
+
+        Raises:
+            SettingsError: a field is unknown or its value impossible.
+        """
+        scenario = changes.get("scenario")
+        followed = self.lidar.channels == channels_for(self.scenario)
+        if followed and isinstance(scenario, Scenario) and "lidar" not in changes:
+            changes["lidar"] = self.lidar.but(channels=channels_for(scenario))
+        return super().but(**changes)
 
     @property
     def sizes(self) -> tuple[int, ...]:
@@ -189,6 +253,19 @@ class Preset(Settings):
     def n_slots(self) -> int:
         """Shepherds of all worlds."""
         return sum(self.sizes)
+
+    @property
+    def rollout_steps(self) -> int:
+        """Shepherd-steps of a rollout. A few fewer are taken where the end of an episode cuts a decision short."""
+        return self.n_slots * self.ppo.n_steps * self.decision_interval
+
+    @property
+    def n_rollouts(self) -> int:
+        """Rollouts of the whole run: the fewest whole checkpoint intervals of `rollout_steps` that hold the budget.
+
+        So the length is known beforehand, and runs that differ in nothing but their seeds have equally many.
+        """
+        return self.checkpoint_rollouts * -(-self.budget // (self.checkpoint_rollouts * self.rollout_steps))
 
     def draw(self) -> Scenario | Mixture:
         """The scenario, or what draws one for each episode."""
@@ -210,6 +287,10 @@ class Preset(Settings):
         if self.gathered:
             scheme["gathered"] = (self.gathered, Gathered())
         return scheme
+
+    def acting(self) -> Acting:
+        """How its policy acts when it is deployed."""
+        return Acting(frame=self.lidar.frame, rest=self.rest, noise=self.noise, noise_steps=self.decision_interval)
 
     def start(self) -> Policy | None:
         """The policy to start from, if there is one.
@@ -243,7 +324,10 @@ class Preset(Settings):
             if name in values and not isinstance(values[name], Scenario):
                 if not isinstance(values[name], Mapping):
                     raise SettingsError(f"Preset.{name}: must be a table (given: {values[name]!r})")
-                values[name] = made(values[name])
+                own = values[name]
+                if name == "lidar":  # by now the scenario has been made
+                    own = {"channels": channels_for(values.get("scenario", Scenario())), **own}
+                values[name] = made(own)
         return cls(**values)
 
     @classmethod
@@ -263,7 +347,7 @@ class Preset(Settings):
 PARTS: dict[str, Callable[[Mapping[str, Any]], Any]] = {
     "scenario": Scenario.from_dict,
     "lidar": lambda table: Lidar(**table),
-    "network": lambda table: SectorNetwork(**table),
+    "network": lambda table: SectorNetwork(**without_scatter(table)),
     "critic": lambda table: CriticNetwork(**table),
     "ppo": lambda table: PPOSettings(**table),
     "validation": lambda table: Validation(**table),
