@@ -85,8 +85,7 @@ class Policy:
         if self._rolls:
             observation, self._offset = observe(observation.reshape(n, *self._frames), self._offset, self._observed)
         acting = self.spec.action
-        first = self._action is None
-        if acting.noise and (first or state.step % acting.noise_steps == 0):
+        if acting.noise and (self._action is None or state.step % acting.noise_steps == 0):
             self._chance = acting.noise * self._rng.standard_normal((n, 2))
         if self._action is None or state.step % self._interval == 0:
             mean, deviation = self._actor(observation)

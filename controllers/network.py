@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -85,6 +86,11 @@ def without_scatter(table: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in table.items() if name != "scatter" or value is not False}
 
 
+def bytes_of(shapes: Mapping[str, tuple[int, ...]]) -> int:
+    """Of float32 arrays of these shapes."""
+    return 4 * sum(math.prod(shape) for shape in shapes.values())
+
+
 def input_shape(lidar: Lidar) -> tuple[int, int]:
     """(R, C): rows and columns of one shepherd's observation, as a network takes it.
 
@@ -115,7 +121,7 @@ class Actor:
             for name in ("groups", "hidden", "latent", "action")
             for array in (np.array(weights[f"{name}.weight"].T, order="C"), np.array(weights[f"{name}.bias"]))
         ]
-        self._log_std = np.array(weights["log_std"])
+        self._deviation = np.exp(weights["log_std"])
 
     def __call__(self, observation: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Means and standard deviations (P, 2), not clipped, of the actions for P observations (P, R, C) float32."""
@@ -123,10 +129,10 @@ class Actor:
             raise ValueError(
                 f"observation: needs the shape (P, {self._shape[0]}, {self._shape[1]}), has {observation.shape}"
             )
-        outputs: NDArray[np.float32] = _forward(
+        means: NDArray[np.float32] = _forward(
             np.ascontiguousarray(observation, np.float32), self._group, self._overlap, *self._layers
         )
-        return outputs, np.exp(np.broadcast_to(self._log_std, outputs.shape))
+        return means, np.broadcast_to(self._deviation, means.shape)
 
 
 @njit(cache=True, error_model="numpy")
@@ -157,7 +163,7 @@ def _forward(observation, group, overlap, w1, b1, w2, b2, w3, b3, w4, b4):  # ty
     latent = np.empty((n, len(b3)), np.float32)
     latent[:] = b3
     _add_layer(latent, hidden, w3)
-    action = np.empty((n, len(b4)), np.float32)
+    action = np.empty((n, 2), np.float32)
     action[:] = b4
     for p in range(n):
         for j in range(len(b3)):

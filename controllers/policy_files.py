@@ -27,7 +27,7 @@ from shepherd_phys.lidar import Lidar
 from shepherd_phys.scenario import Scenario
 from shepherd_phys.settings import Settings, SettingsError, settings, tagged, untagged
 
-from .network import ARCHITECTURES, SectorNetwork, without_scatter
+from .network import ARCHITECTURES, SectorNetwork, bytes_of, without_scatter
 
 FORMAT = "shepherd_phys policy"
 FORMAT_VERSION = 1
@@ -155,11 +155,10 @@ def read_policy(
         raise PolicyError(f"{path}: {_brief(str(error))}") from None
     except (TypeError, ValueError, OverflowError, RecursionError) as error:
         raise PolicyError(f"{path}: is not a policy ({_brief(str(error))})") from None
-    size = 4 * sum(math.prod(shape) for shape in shapes.values())
+    size = bytes_of(shapes)
     if size > MAX_WEIGHTS:
         raise PolicyError(f"{path}: network: {size} bytes of weights; at most {MAX_WEIGHTS} are read")
-    lidar = spec.lidar
-    kept = ((lidar.stack - 1) * lidar.stack_stride + 1) * len(lidar.channels) * lidar.beams
+    kept = spec.lidar.remembered
     if kept > MAX_FRAMES:
         raise PolicyError(f"{path}: lidar: {kept} numbers of frames to remember a shepherd; at most {MAX_FRAMES}")
     beside = path.with_suffix(".safetensors")

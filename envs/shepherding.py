@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from shepherd_phys.lidar import CHANNELS, Lidar, Scan, Stack, encode
+from shepherd_phys.lidar import Lidar, Scan, Stack, encode
 from shepherd_phys.scenario import Scenario, load_scenario
 from shepherd_phys.settings import SettingsError
 from shepherd_phys.state import Floats, WorldState
@@ -119,7 +119,7 @@ class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.render_size = render_size
         self._scheme = checked(rewards)
         if lidar == "default":
-            lidar = Lidar(channels=CHANNELS if self.scenario.obstacles else CHANNELS[:3])
+            lidar = Lidar(channels=self.scenario.channels)
         if lidar is not None and not isinstance(lidar, Lidar):
             raise SettingsError(f"lidar: needs a Lidar, None or 'default' (given: {lidar!r})")
         self.lidar = lidar

@@ -12,7 +12,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from shepherd_phys.lidar import CHANNELS, Lidar
+from shepherd_phys.lidar import Lidar
 from shepherd_phys.scenario import Scenario, load_scenario
 from shepherd_phys.settings import SettingsError
 
@@ -120,8 +120,7 @@ class TeamVecEnv(VecEnv):
         if not isinstance(scenario, Scenario) and not callable(scenario):
             scenario = load_scenario(scenario)
         if lidar is None:
-            obstacles = isinstance(scenario, Scenario) and scenario.obstacles
-            lidar = Lidar(channels=CHANNELS if obstacles else CHANNELS[:3])
+            lidar = Lidar(channels=scenario.channels) if isinstance(scenario, Scenario) else Lidar()
         if not isinstance(lidar, Lidar):
             raise SettingsError(f"lidar: needs a Lidar or None (given: {lidar!r})")
         _one_of("credit", credit, ("team", "own"))

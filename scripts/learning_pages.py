@@ -12,7 +12,7 @@ from .pages import line
 
 Scheme = tuple[str, str]
 """(recipe, reward)."""
-TIMED = ("fast", "wild")
+TIMED_SCHEME = ("fast", "wild")
 """The scheme of whose runs the time to home is told."""
 HALF = 50.0
 """Sheep in at the end of training episodes that count as a beginning [%]."""
@@ -24,7 +24,7 @@ def figure1_page(curves: Sequence[Row], validations: Sequence[Row], home: Sequen
     Args:
         curves: rows of ``figure1.csv``.
         validations: rows of ``figure1-validation.csv``.
-        home: rows of ``time-to-home.csv``, of runs of `TIMED` that were trained alone.
+        home: rows of ``time-to-home.csv``, of runs of `TIMED_SCHEME` that were trained alone.
     """
     flocks = _flocks(validations)
     head = ["recipe", "reward", "seeds", "final reward", "levels off at", *map(_flocks_word, flocks), "rate", "time"]
@@ -50,7 +50,7 @@ def figure1_page(curves: Sequence[Row], validations: Sequence[Row], home: Sequen
     for recipe, reward in _schemes(curves):
         curve = curve_of(curves, recipe, reward)
         lasts = _lasts(curves, recipe, reward)
-        alone = [row for row in lasts if (recipe, reward) == TIMED and row["seed"] in timed]
+        alone = [row for row in lasts if (recipe, reward) == TIMED_SCHEME and row["seed"] in timed]
         paced = alone or lasts
         off = levels_off_at(curve)
         at_end = _at_end(validations, recipe, reward)
@@ -86,8 +86,8 @@ def _home(home: Sequence[Row]) -> list[str]:
         "",
         "**Time to home**",
         "",
-        f"Of the first runs of `{TIMED[1]}`, each trained with nothing beside it: training until the first checkpoint "
-        f"whose policy delivers at least {HOME:g} % with each number of flocks in "
+        f"Of the first runs of `{TIMED_SCHEME[1]}`, each trained with nothing beside it: training until the first "
+        f"checkpoint whose policy delivers at least {HOME:g} % with each number of flocks in "
         "validation; that policy, judged once on reported trials: sheep in the goal at the end, %, mean [95 % "
         "bootstrap interval].",
         "",

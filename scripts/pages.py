@@ -117,22 +117,16 @@ def part_cells(part: Mapping[str, Any]) -> tuple[str, ...]:
         if part.get("budget") is not None:
             at += f", {part['budget'] / 1e6:.2f} M shepherd-steps"
     digits = ".2f" if 0 in (part["least"], part["most"]) else ".1f"  # a correlation, or percent and metres
-    value = part["note"]
-    if part["value"] is not None:
-        value = _known(part, digits)
+    value = part["note"] if part["value"] is None else _interval(part, "value", "", digits)
     verdict = part["verdict"] if part["counts"] else f"({part['verdict']}, beside)"
     return method, at, value, part["claimed"], verdict
 
 
-def _known(part: Mapping[str, Any], digits: str) -> str:
-    """The number of a part; ends of its interval may be at infinity."""
-    low = "-∞" if part["low"] is None else f"{part['low']:{digits}}"
-    high = "∞" if part["high"] is None else f"{part['high']:{digits}}"
-    return f"{part['value']:{digits}} [{low}, {high}]"
-
-
 def _interval(row: Mapping[str, Any], value: str, prefix: str, digits: str) -> str:
-    return f"{row[value]:{digits}} [{row[f'{prefix}low']:{digits}}, {row[f'{prefix}high']:{digits}}]"
+    """A value with its interval, an end of which is None where it is at infinity."""
+    low, high = row[f"{prefix}low"], row[f"{prefix}high"]
+    ends = "-∞" if low is None else f"{low:{digits}}", "∞" if high is None else f"{high:{digits}}"
+    return f"{row[value]:{digits}} [{', '.join(ends)}]"
 
 
 def _range(values: Iterable[Any]) -> str:

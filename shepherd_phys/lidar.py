@@ -86,6 +86,16 @@ class Lidar(Settings):
         if self.frame == "goal" and "goal" not in self.channels:
             raise ValueError(f"frame 'goal' needs the channel 'goal' (given: channels {self.channels})")
 
+    @property
+    def look_back(self) -> int:
+        """Frames that an observation looks back over, this one included."""
+        return (self.stack - 1) * self.stack_stride + 1
+
+    @property
+    def remembered(self) -> int:
+        """Numbers in the frames that are kept for one shepherd."""
+        return self.look_back * len(self.channels) * self.beams
+
     def observation_shape(self, n_shepherds: int) -> tuple[int, ...]:
         """Shape of the observation of a team: (P, stack x channels, columns), or (P, channels x columns, 1, stack)."""
         columns = self.sectors or self.beams
@@ -303,7 +313,7 @@ class Stack:
 
     def __init__(self, lidar: Lidar) -> None:
         self._lidar = lidar
-        self._frames: deque[Proximities] = deque(maxlen=(lidar.stack - 1) * lidar.stack_stride + 1)
+        self._frames: deque[Proximities] = deque(maxlen=lidar.look_back)
 
     def reset(self) -> None:
         """Forget all frames."""

@@ -12,6 +12,7 @@ from pydantic import BeforeValidator, Field
 
 from shepherd_phys.bodies import BODIES, SHEEP, Body, Disc
 from shepherd_phys.flock import FLOCKS, FlockModel, Strombom
+from shepherd_phys.lidar import CHANNELS, Channel
 from shepherd_phys.obstacles import OBSTACLES, Obstacle
 from shepherd_phys.settings import (
     Settings,
@@ -122,6 +123,11 @@ class Scenario(Settings):
     def n_shepherds(self) -> int:
         """P."""
         return len(self.shepherds)
+
+    @property
+    def channels(self) -> tuple[Channel, ...]:
+        """What shepherds observe here unless somebody says otherwise: obstacles where there are some."""
+        return CHANNELS if self.obstacles else CHANNELS[:3]
 
     @property
     def n_substeps(self) -> int:

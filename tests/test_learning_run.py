@@ -65,9 +65,8 @@ def assert_same_run(a, b):
         assert load_policy(a / name).checksum == load_policy(b / name).checksum
 
 
-@pytest.mark.parametrize("rollouts", [1, 2, 3, 5])
-def test_a_run_that_was_stopped_and_resumed_is_the_unbroken_one(rollouts, unbroken, tmp_path):
-    begin(tmp_path, PRESET)
+def train_and_die(folder, rollouts):
+    """Train for so many rollouts and go no further."""
     seen = []
 
     def report(progress):
@@ -76,7 +75,13 @@ def test_a_run_that_was_stopped_and_resumed_is_the_unbroken_one(rollouts, unbrok
             raise Killed
 
     with pytest.raises(Killed):
-        train(tmp_path, report=report)
+        train(folder, report=report)
+
+
+@pytest.mark.parametrize("rollouts", [1, 2, 3, 5])
+def test_a_run_that_was_stopped_and_resumed_is_the_unbroken_one(rollouts, unbroken, tmp_path):
+    begin(tmp_path, PRESET)
+    train_and_die(tmp_path, rollouts)
     train(tmp_path)
     assert_same_run(tmp_path, unbroken)
 
@@ -335,15 +340,7 @@ def test_tensorboard_shows_each_rollout_once(unbroken, tmp_path):
 
     begin(tmp_path, PRESET)
     for rollouts in (1, 3, 2):  # the first of these processes dies before there is a checkpoint
-        seen = []
-
-        def report(progress, seen=seen, rollouts=rollouts):
-            seen.append(progress)
-            if sum(not p.validation for p in seen) >= rollouts:
-                raise Killed
-
-        with pytest.raises(Killed):
-            train(tmp_path, report=report)
+        train_and_die(tmp_path, rollouts)
     train(tmp_path)
     curve = rows_of(tmp_path / "curve.csv")
     whole = shown(tmp_path)

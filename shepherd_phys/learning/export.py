@@ -124,8 +124,7 @@ def _actor(policy: TeamPolicy) -> dict[str, nn.Parameter]:
         "action": policy.action_net,
     }
     named = {f"{name}.{part}": getattr(layer, part) for name, layer in layers.items() for part in ("weight", "bias")}
-    named["log_std"] = policy.log_std
-    return named
+    return {**named, "log_std": policy.log_std}
 
 
 def _check_names(wanted: Collection[str], given: Collection[str]) -> None:

@@ -10,11 +10,11 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BeforeValidator, Field
 
 from shepherd_phys.controllers.learned import POLICIES, Policy, load_policy
-from shepherd_phys.controllers.network import SectorNetwork, input_shape, without_scatter
+from shepherd_phys.controllers.network import SectorNetwork, bytes_of, input_shape, without_scatter
 from shepherd_phys.controllers.policy_files import MAX_FRAMES, MAX_WEIGHTS, Acting
 from shepherd_phys.envs.mixture import Mixture
 from shepherd_phys.envs.rewards import SCHEMES, Effort, Gathered, Occlusion, Term
-from shepherd_phys.lidar import CHANNELS, Lidar
+from shepherd_phys.lidar import Lidar
 from shepherd_phys.scenario import SCENARIOS, Scenario
 from shepherd_phys.settings import Settings, SettingsError, read_toml, settings, write_toml
 
@@ -116,11 +116,6 @@ class Validation(Settings):
             raise ValueError(f"{points} points x {self.trials} trials: at most {MOST_EPISODES} episodes a validation")
 
 
-def channels_for(scenario: Scenario) -> tuple[Any, ...]:
-    """What shepherds observe there unless somebody says otherwise: obstacles where there are some."""
-    return CHANNELS if scenario.obstacles else CHANNELS[:3]
-
-
 @settings
 class Preset(Settings):
     """A training run. The defaults are what trains fast; the budget and rates are in shepherd-steps (control steps
@@ -174,7 +169,7 @@ class Preset(Settings):
     scenario: Scenario = Scenario()
     lidar: Lidar = Field(
         default_factory=lambda given: Lidar(
-            channels=channels_for(given.get("scenario", Scenario())), sectors=64, frame="goal"
+            channels=given.get("scenario", Scenario()).channels, sectors=64, frame="goal"
         )
     )
     """Its channels follow from the scenario where nobody gives them."""
@@ -202,7 +197,7 @@ class Preset(Settings):
             self.acting()  # what no policy file can say is refused before anything is learned
         except SettingsError as error:
             raise ValueError(str(error)) from None
-        self._check_size(4 * sum(math.prod(shape) for shape in shapes.values()))
+        self._check_size(bytes_of(shapes))
         if self.ppo.batch_size > self.n_slots * self.ppo.n_steps:
             raise ValueError(
                 f"ppo.batch_size: {self.ppo.batch_size} is more than a rollout holds: "
@@ -216,7 +211,7 @@ class Preset(Settings):
         lidar = self.lidar
         if weights > MAX_WEIGHTS:
             raise ValueError(f"network: {weights} bytes of weights; a policy may have {MAX_WEIGHTS}")
-        frames = ((lidar.stack - 1) * lidar.stack_stride + 1) * len(lidar.channels) * lidar.beams
+        frames = lidar.remembered
         if frames > MAX_FRAMES:
             raise ValueError(f"lidar: {frames} numbers of frames to remember; a policy may have {MAX_FRAMES}")
         bounds = {
@@ -239,9 +234,9 @@ class Preset(Settings):
             SettingsError: a field is unknown or its value impossible.
         """
         scenario = changes.get("scenario")
-        followed = self.lidar.channels == channels_for(self.scenario)
+        followed = self.lidar.channels == self.scenario.channels
         if followed and isinstance(scenario, Scenario) and "lidar" not in changes:
-            changes["lidar"] = self.lidar.but(channels=channels_for(scenario))
+            changes["lidar"] = self.lidar.but(channels=scenario.channels)
         return super().but(**changes)
 
     @property
@@ -326,7 +321,7 @@ class Preset(Settings):
                     raise SettingsError(f"Preset.{name}: must be a table (given: {values[name]!r})")
                 own = values[name]
                 if name == "lidar":  # by now the scenario has been made
-                    own = {"channels": channels_for(values.get("scenario", Scenario())), **own}
+                    own = {"channels": values.get("scenario", Scenario()).channels, **own}
                 values[name] = made(own)
         return cls(**values)
 
