@@ -123,10 +123,15 @@ class Effort(Settings):
     episode, to the path length over that of running all the time: 1 at most, but for what pushes a shepherd.
     """
 
+    team: int = Field(default=1, ge=1, le=1000)
+    """Shepherds of the smallest team that pays in full; P fewer pay P / ``team`` of it. The work to be done is that of
+    the sheep: a lone shepherd must walk for three, and would rather not for the price that three can pay."""
+
     def shares(self, before: WorldState, after: WorldState, scan: Scan | None, scenario: Scenario) -> Floats:
-        """(P,) each shepherd's speed over its top speed, over T."""
+        """(P,) each shepherd's speed over its top speed, over T; in teams smaller than ``team`` less."""
         walked = after.shepherd_path - before.shepherd_path
-        return np.asarray(walked / (after.shepherd_max_speed * (scenario.control_dt * scenario.n_steps)))
+        price = min(after.n_shepherds / self.team, 1.0)
+        return np.asarray(walked * price / (after.shepherd_max_speed * (scenario.control_dt * scenario.n_steps)))
 
     def __call__(self, before: WorldState, after: WorldState, scan: Scan | None, scenario: Scenario) -> float:
         """Mean of the shares, 0 where there is no shepherd."""

@@ -10,7 +10,7 @@ from test_learned import LIDAR, SMALL, random_weights, spec_of
 from shepherd_phys.controllers import Policy, load_policy
 from shepherd_phys.controllers.network import Actor, SectorNetwork, input_shape
 from shepherd_phys.controllers.policy_files import Acting, PolicyError
-from shepherd_phys.envs.rewards import SCHEMES
+from shepherd_phys.envs.rewards import SCHEMES, Effort
 from shepherd_phys.envs.team import TeamVecEnv
 from shepherd_phys.learning.export import actor_weights, load_actor, to_policy, to_sb3
 from shepherd_phys.learning.export import spec_of as spec_of_preset
@@ -329,7 +329,9 @@ def test_a_preset_may_mix_worlds_and_price_effort():
     assert preset.sizes == (3, 1, 3, 1, 3) and preset.n_slots == 11
     drawn = preset.draw()(np.random.default_rng(0), 0)
     assert 1 <= drawn.n_flocks <= 3 and drawn.flock == TINY.scenario.flock
-    assert preset.scheme()["effort"][0] == -2.0 and preset.scheme()["gathered"][0] == 3.0
+    assert preset.scheme()["effort"] == (-2.0, Effort())
+    assert preset.but(effort_team=3).scheme()["effort"] == (-2.0, Effort(team=3))
+    assert preset.scheme()["gathered"][0] == 3.0
     assert set(TINY.scheme()) == set(SCHEMES["wild"])
     spec = spec_of_preset(TINY.but(rest=0.25, noise=0.5))
     assert spec.action == Acting(frame="goal", rest=0.25, noise=0.5, noise_steps=TINY.decision_interval)

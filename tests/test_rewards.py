@@ -64,6 +64,9 @@ def test_effort_is_the_path_over_that_of_running_all_the_time():
     assert own == pytest.approx(env.state.shepherd_path / furthest, rel=1e-12)
     assert paid == pytest.approx(-2.0 * info["path_length"] / furthest, rel=1e-12)
     assert 0.2 < own[1] < 0.3 < 0.9 < own[0] <= 1.0
+    start = WorldState.of({**vars(env.state), "shepherd_path": np.zeros(2)})
+    for team, price in ((1, 1.0), (2, 1.0), (3, 2 / 3), (8, 0.25)):  # two of them are a small team for the last two
+        assert Effort(team=team).shares(start, env.state, None, scenario) == pytest.approx(price * own, rel=1e-12)
     nobody = WorldState.of({**vars(env.state), "shepherd_path": np.zeros(0), "shepherd_max_speed": np.zeros(0)})
     assert effort(nobody, nobody, None, scenario) == 0.0
 
