@@ -44,6 +44,11 @@ class Mixture(Settings):
         if self.n_neighbours is not None and not hasattr(self.base.flock, "n_neighbours"):
             raise ValueError(f"n_neighbours: {type(self.base.flock).__name__} has none; give None")
 
+    @property
+    def has_obstacles(self) -> bool:
+        """Whether its worlds can have obstacles."""
+        return self.base.has_obstacles
+
     def __call__(self, rng: np.random.Generator, index: int) -> Scenario:
         """The scenario of the next episode; the world's index plays no part."""
         n_flocks = int(rng.integers(*self.n_flocks, endpoint=True))

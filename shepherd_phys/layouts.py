@@ -230,8 +230,8 @@ class Scattered(Settings):
         else:
             field, given, best = "count", f"{self.count}", f"{most:.0f}"
         raise PlacementError(
-            f"Scattered.{field}: {given} is impossible: beside goal and bodies, obstacles of radius {self.radius:g} m in a "
-            f"box of {site.box:g} m reached {best}; at most about that is allowed"
+            f"Scattered.{field}: {given} is impossible: beside goal and bodies, obstacles of radius {self.radius:g} m "
+            f"in a box of {site.box:g} m reached {best}; at most about that is allowed"
         )
 
     def _fill(self, rng: np.random.Generator, site: Site) -> float | None:

@@ -541,7 +541,7 @@ MISTAKES = [
     ("--flock mine:Moody", "mine:Moody: cannot be written, because it does not say what its parameters are"),
     ("--scenario herd.toml --body mine:Cart", "'mine:Crowd' is a class of somebody's own and was not handed over"),
     ("--scenario herd.toml --flock mine:Crowd", "--body module:Name hands over a body and --flock"),
-    ("--scenario post.toml", "nothing hands over an obstacle"),
+    ("--scenario post.toml", "evaluate --scenario module:Name a whole scenario with obstacles"),
     ("--scenario broken.toml --body mine:Cart", "Scenario.shepherds[0]: mine:Cart: a cart has a size"),
     ("--scenario full.toml", "obstacles"),
     ("--grid nowhere.toml", "nowhere.toml: cannot be read"),
