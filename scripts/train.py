@@ -126,14 +126,10 @@ def prepare(options: Train, given: set[str]) -> tuple[Path, Preset]:
             changed.to_toml(options.out / PRESET)
         return options.out, changed
     preset = asked(load_preset(options.preset), options, given)
-    words = [
-        Path(options.preset).stem,
-        preset.reward,
-        preset.seed,
-        *([Path(options.scenario).stem] if options.scenario else []),
-    ]
+    words = [Path(options.preset).stem, preset.reward, str(preset.seed)]
+    words += [Path(options.scenario).stem] if options.scenario is not None else []
     words += [f"{name}{getattr(options, name):g}" for name in ("obstacles", "density") if name in given]
-    folder = options.out or Path("runs") / "-".join(map(str, words))
+    folder = options.out or Path("runs") / "-".join(words)
     # before a folder is made that the next attempt would find
     preset.start()
     if preset.scenario.has_obstacles:

@@ -43,7 +43,7 @@ class Avoidance(Settings):
         around = state.surroundings
         if around.known:
             return np.asarray(
-                summed_pushes(state.sheep_pos, around.shapes, around.static, self.weight, self.range, self.decay)
+                summed_pushes(state.sheep_pos, *around.shapes, around.static, self.weight, self.range, self.decay)
             )
         distance, away = around.static_distances(state.sheep_pos)
         size = np.where(distance < self.range, self.weight * np.exp(-self.decay * distance / self.range), 0.0)
@@ -51,8 +51,15 @@ class Avoidance(Settings):
 
 
 @njit(cache=True, error_model="numpy")
-def summed_pushes(points: Floats, shapes: Shapes, which: Ints, weight: float, reach: float, decay: float) -> Floats:
-    """The pushes of `Avoidance` on points (N, 2) [m] by the shapes ``which`` (K,), which stand still: (N, 2)."""
+def summed_pushes(
+    points: Floats, table: Ints, radius: Floats, corners: Floats, boxes: Floats, boxed: bool,
+    which: Ints, weight: float, reach: float, decay: float,
+) -> Floats:  # fmt: skip
+    """The pushes of `Avoidance` on points (N, 2) [m] by the shapes ``which`` (K,), which stand still: (N, 2).
+
+    The fields of `Shapes` come one by one: a tuple takes longer to hand over than to use here.
+    """
+    shapes = Shapes(table, radius, corners, boxes, boxed)
     pushed = np.zeros((len(points), 2))
     left, bottom, right, top = math.inf, math.inf, -math.inf, -math.inf
     for i in range(len(points)):
