@@ -60,8 +60,9 @@ def _threatened(state: WorldState, scenario: Scenario) -> float:
 def obstacle_cost(count: int, n_steps: int, seed: int) -> dict[str, float]:
     """One run: the environment's steps while a flock of 100 sheep is driven, with obstacles and without, in turn.
 
-    Times are of the processor, in which other work on the machine counts little. The episodes begin alike. With obstacles an observation has a fourth channel, all others are cut, sheep feel what is
-    near, and a control step has three engine steps instead of two.
+    Times are of the processor, in which other work on the machine counts little. The episodes begin alike. With
+    obstacles an observation has a fourth channel, all others are cut, sheep feel what is near, and a control step has
+    three engine steps instead of two.
 
     Args:
         count: obstacles, of all kinds.

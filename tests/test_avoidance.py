@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pymunk
 import pytest
-
 from scenes import arranged
+
 from shepherd_phys.avoidance import NO_PUSH, Avoidance
 from shepherd_phys.flock import Strombom
 from shepherd_phys.obstacles import Box, Fence, Pillar, Polygon, Wall
