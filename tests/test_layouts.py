@@ -78,20 +78,11 @@ def test_obstacles_have_a_stream_of_their_own():
         assert bare.user_rng.random() == strewn.user_rng.random()
 
 
-def frame(state):
-    """Unit vectors towards the middle of the flocks' arc, from a fence or corridor, and the goal."""
-    shapes = state.obstacles
-    start, end = np.array(shapes[0].start), np.array(shapes[0].end)
-    along = (end - start) / np.linalg.norm(end - start)
-    return along, np.array([along[1], -along[0]])
-
-
 @pytest.mark.parametrize("name", ["fence", "corridor"])
 def test_flocks_are_behind_the_fence_and_before_the_corridor(name):
     world = World(SCENARIOS[name].but(n_flocks=4, flock_sd=0.4))
     for seed in range(8):
         state = world.reset(seed)
-        along, ahead = frame(state)
         middle = np.mean([(np.array(o.start) + o.end) / 2 for o in state.obstacles], axis=0) - state.goal_pos
         ahead = middle / np.linalg.norm(middle)
         for flock in np.split(state.sheep_pos, 4):
