@@ -23,9 +23,9 @@ from shepherd_phys.settings import Settings, SettingsError, kind_of, settings
 
 Floats = NDArray[np.float64]
 
-MISSES = 400
+MISSES = 200
 """Places tried in vain after which there is no room for a further obstacle."""
-DRAWS = 5
+DRAWS = 3
 """Arrangements begun anew after which obstacles that found no room are an error."""
 UNEVEN = 0.6
 """How unevenly the corners of a random polygon are spread: below 0.9 it stays thicker than 0.6 of its disc's radius."""
@@ -78,7 +78,7 @@ class Site:
     def clear(self) -> None:
         """Give back all that was taken."""
         self.taken: list[Obstacle] = []
-        self._bare, self._wide = pymunk.Space(), pymunk.Space()
+        self._space = pymunk.Space()  # nothing moves in it
         self._cluster: dict[pymunk.Shape, int] = {}
         for obstacle in self.fixed:
             self._add(obstacle, merge=True)
@@ -110,24 +110,50 @@ class Site:
         Only a ring of such shapes closes off a pocket. There is none if no new obstacle comes near to two shapes of the
         same cluster: then clusters, as graphs of who is near to whom, stay trees.
         """
-        index = len(self.taken)
-        bare = solid(obstacle, index, self._bare.static_body)
-        if not merge and any(self._bare.shape_query(shape) for shape in bare):
-            return False
-        wide = solid(obstacle, index, self._wide.static_body)
-        for shape in wide:
-            shape.unsafe_set_radius(shape.radius + self.passage)
-        near = [self._cluster[hit.shape] for shape in wide for hit in self._wide.shape_query(shape) if hit.shape]
+        shapes = solid(obstacle, len(self.taken), self._space.static_body)
+        near: list[int] = []
+        for shape in shapes:
+            box, reach = shape.cache_bb(), 2 * self.passage
+            around = pymunk.BB(box.left - reach, box.bottom - reach, box.right + reach, box.top + reach)
+            for other in self._space.bb_query(around, pymunk.ShapeFilter()):
+                gap = _gap(shape, other)
+                if gap < 0 and not merge:
+                    return False
+                if gap < reach:
+                    near.append(self._cluster[other])
         if not merge and len(set(near)) < len(near):
             return False
         own = len(self._cluster)  # no cluster has had this number
         for shape, cluster in self._cluster.items():
             if cluster in near:
                 self._cluster[shape] = own
-        self._cluster.update(dict.fromkeys(wide, own))
-        self._bare.add(*bare)
-        self._wide.add(*wide)
+        self._cluster.update(dict.fromkeys(shapes, own))
+        self._space.add(*shapes)
         return True
+
+
+def _gap(a: pymunk.Shape, b: pymunk.Shape) -> float:
+    """Distance between two convex shapes that stand still, below 0 where they overlap [m].
+
+    It is that of a corner from the other shape, unless edges cross. (The engine's own test for overlap is not to be had
+    for this: it does not see that two segments touch end to end.)
+    """
+    least = math.inf
+    for one, other in ((a, b), (b, a)):
+        corners = _corners(one)
+        least = min(least, *(other.point_query(corner).distance - one.radius for corner in corners))
+        for i in range(1 if len(corners) == 2 else len(corners)):
+            if len(corners) > 1 and other.segment_query(corners[i - 1], corners[i]) is not None:
+                return -1.0
+    return least
+
+
+def _corners(shape: pymunk.Shape) -> list[pymunk.Vec2d]:
+    if isinstance(shape, pymunk.Circle):
+        return [shape.offset]
+    if isinstance(shape, pymunk.Segment):
+        return [shape.a, shape.b]
+    return list(shape.get_vertices())
 
 
 @runtime_checkable
@@ -171,7 +197,8 @@ def laid_out(layout: Layout, rng: np.random.Generator, site: Site) -> tuple[tupl
                 f"{name}: an obstacle is {gap:.3g} m from the goal's border; at least {site.goal_keep_out:g} m are "
                 "allowed (goal_keep_out)"
             )
-        clear = partial(_moved_clear, surfaces((*site.fixed, *drawn)), site.body_keep_out)
+        solids = (*site.fixed, *drawn)
+        clear = partial(_moved_clear, surfaces(solids), site.body_keep_out) if solids else None
         try:
             return drawn, relax(site.body_pos, site.body_radius, push_out=clear)
         except PlacementError:
