@@ -22,6 +22,7 @@ from shepherd_phys.lidar import CHANNELS, Lidar
 from shepherd_phys.obstacles import Box, Fence, Pillar, Polygon, Wall
 from shepherd_phys.placement import PlacementError
 from shepherd_phys.scenario import SCENARIOS, Scenario
+from shepherd_phys.scripts.points import episode, find_scenario, points
 from shepherd_phys.settings import SettingsError
 from shepherd_phys.world import World
 
@@ -340,3 +341,23 @@ def test_a_policy_that_knows_three_channels_runs_among_obstacles(tmp_path):
         load_policy(tmp_path / "tiny.json"), partial(ShepherdingEnv, SCENARIOS["fence"].but(n_steps=5)), [0]
     )
     assert row["steps"] == 5
+
+
+def test_a_scenario_of_a_users_own_is_found_by_name(tmp_path, monkeypatch):
+    (tmp_path / "my_rocks.py").write_text(
+        "from shepherd_phys.obstacles import Pillar\n"
+        "from shepherd_phys.scenario import SCENARIOS\n"
+        "def rocks(rng, site):\n    return [Pillar((25.0, 25.0), 0.5 + rng.random())]\n"
+        "ROCKY = SCENARIOS['small'].but(layout=rocks, goal_pos=(0.0, 0.0))\n"
+        "def make():\n    return ROCKY.but(n_steps=7)\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert find_scenario("my_rocks:make") == find_scenario("my_rocks:ROCKY").but(n_steps=7)
+    (point,) = points(controllers=["idle"], scenario="my_rocks:make")
+    assert point.scenario_name == "my_rocks:make"
+    before = point.settings_hash()
+    assert episode(point, 0)["steps"] == 7
+    with open("my_rocks.py", "a") as file:
+        file.write("# edited\n")
+    assert point.settings_hash() != before  # a layout whose file was edited must not find the rows of the old one
