@@ -10,8 +10,8 @@ import pytest
 from scipy import ndimage
 
 from shepherd_phys.avoidance import Avoidance
-from shepherd_phys.controllers import load_policy
-from shepherd_phys.controllers.evaluation import evaluate
+from shepherd_phys.controllers import CONTROLLERS, load_policy
+from shepherd_phys.controllers.evaluation import evaluate, trial_seed
 from shepherd_phys.controllers.network import SectorNetwork
 from shepherd_phys.controllers.policy_files import Acting, PolicySpec, write_policy
 from shepherd_phys.envs import ShepherdingEnv
@@ -26,6 +26,7 @@ from shepherd_phys.scripts.points import episode, find_scenario, points
 from shepherd_phys.settings import SettingsError
 from shepherd_phys.world import World
 
+TUNED = ("strombom", "pierson", "elfiqi", "occlusion")
 ALL = ("Pillar", "Wall", "Box", "Polygon")
 LAID_OUT = {name: SCENARIOS[name] for name in ("fence", "corridor", "lattice", "scattered")} | {
     "mixed": Scenario(layout=Scattered(density=0.03, kinds=ALL)),
@@ -361,3 +362,12 @@ def test_a_scenario_of_a_users_own_is_found_by_name(tmp_path, monkeypatch):
     with open("my_rocks.py", "a") as file:
         file.write("# edited\n")
     assert point.settings_hash() != before  # a layout whose file was edited must not find the rows of the old one
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", ["fence", "scattered"])
+@pytest.mark.parametrize("name", TUNED)
+def test_every_tuned_team_brings_the_flocks_home_among_drawn_obstacles(name, preset):
+    seeds = [trial_seed(0, trial) for trial in range(3)]
+    rows = evaluate(CONTROLLERS[name](), partial(ShepherdingEnv, SCENARIOS[preset]), seeds)
+    assert np.mean([row["in_goal_end"] for row in rows]) > 90.0
