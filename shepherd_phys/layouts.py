@@ -28,7 +28,7 @@ MISSES = 200
 DRAWS = 3
 """Arrangements begun anew after which obstacles that found no room are an error."""
 UNEVEN = 0.6
-"""How unevenly the corners of a random polygon are spread: below 0.9 it stays thicker than 0.6 of its disc's radius."""
+"""How unevenly the corners of a random polygon are spread: with this it stays thicker than 0.7 of its disc's radius."""
 PASSAGE = 0.5
 """[m]. The teams' own clearance: between obstacles that are further apart than twice this, shepherds find a way."""
 
