@@ -28,7 +28,7 @@ MISSES = 200
 DRAWS = 3
 """Arrangements begun anew after which obstacles that found no room are an error."""
 UNEVEN = 0.6
-"""How unevenly the corners of a random polygon are spread: with this it stays thicker than 0.7 of its disc's radius."""
+"""How unevenly the corners of a random polygon are spread: with this it stays thicker than 0.6 of its disc's radius."""
 PASSAGE = 0.5
 """[m]. The teams' own clearance: between obstacles that are further apart than twice this, shepherds find a way."""
 
@@ -225,7 +225,7 @@ class Scattered(Settings):
     """How many."""
     density: float | None = Field(default=None, ge=0, le=0.5)
     """Instead: covered area over the area of the box [1], to the nearest whole obstacle."""
-    radius: float = Field(default=1.0, ge=1.5 * MIN_THICKNESS)
+    radius: float = Field(default=1.0, ge=2 * MIN_THICKNESS)
     """Of the disc that holds one [m]: a pillar is that disc, a wall its diameter with the default thickness, a box is a
     square and a polygon has 3 to 6 corners at random on its edge; all but pillars are turned at random."""
     kinds: Annotated[
