@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BeforeValidator, Field
 
+from shepherd_phys.lidar import Channel
 from shepherd_phys.scenario import Scenario
 from shepherd_phys.settings import Settings, settings
 
@@ -43,6 +44,11 @@ class Mixture(Settings):
             raise ValueError(f"base.flock_sizes: a mixture draws its own (given: {self.base.flock_sizes})")
         if self.n_neighbours is not None and not hasattr(self.base.flock, "n_neighbours"):
             raise ValueError(f"n_neighbours: {type(self.base.flock).__name__} has none; give None")
+
+    @property
+    def channels(self) -> tuple[Channel, ...]:
+        """What shepherds observe unless somebody says otherwise; see `Scenario.channels`."""
+        return self.base.channels
 
     def __call__(self, rng: np.random.Generator, index: int) -> Scenario:
         """The scenario of the next episode; the world's index plays no part."""

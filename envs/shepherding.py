@@ -46,7 +46,7 @@ class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     | sheep | the nearest sheep along the beam | 50 m |
     | shepherds | the nearest other shepherd | 50 m |
     | goal | the goal's border (from inside: the way out) | 75 m |
-    | obstacles (where the scenario has some) | the nearest obstacle; it also cuts the other channels | 50 m |
+    | obstacles (where the scenario can have some) | the nearest obstacle; it also cuts the other channels | 50 m |
 
     Beam k points at 2 pi k / 512 from the x axis. A value is 1 - distance / range, 0 where nothing is seen. Fewer
     sectors, the goal frame and the paper's 1536 x 1 x 3 arrangement are settings of `shepherd_phys.lidar.Lidar`. In the

@@ -88,7 +88,7 @@ class TeamVecEnv(VecEnv):
     | scenario | ``"paper"`` | a `Scenario`, a preset's name, a TOML file, or a function (rng, world) -> `Scenario`, asked at each episode, such as a `shepherd_phys.envs.mixture.Mixture` |
     | team_sizes | ``(3,)`` | shepherds of each world; bodies are the scenario's own, taken in turn |
     | rewards | ``"wild"`` | a scheme or its name |
-    | lidar | ``None`` | a `Lidar`; none given: the default one, with obstacles where a given scenario has some |
+    | lidar | ``None`` | a `Lidar`; none given: the default one, with the channels of the scenario, or of what draws it (``channels``) |
     | decision_interval | 1 | control steps of a decision |
     | credit | ``"team"`` | or ``"own"`` |
     | critic | ``"own"`` | what the critic sees more than the actor: nothing, or the ``"world"`` |
@@ -120,7 +120,8 @@ class TeamVecEnv(VecEnv):
         if not isinstance(scenario, Scenario) and not callable(scenario):
             scenario = load_scenario(scenario)
         if lidar is None:
-            lidar = Lidar(channels=scenario.channels) if isinstance(scenario, Scenario) else Lidar()
+            # a function that draws scenarios may name their channels
+            lidar = Lidar(channels=getattr(scenario, "channels", Lidar().channels))
         if not isinstance(lidar, Lidar):
             raise SettingsError(f"lidar: needs a Lidar or None (given: {lidar!r})")
         _one_of("credit", credit, ("team", "own"))

@@ -34,6 +34,7 @@ from shepherd_phys.world import World
 
 from .command import at_least, fail, parsed
 from .impacts import impacts
+from .obstacle_cost import obstacle_cost
 from .plain import PlainWorld
 from .points import find_controller
 from .throughput import throughput
@@ -58,7 +59,9 @@ class Arguments:
     steps: Annotated[int, tyro.conf.arg(metavar="N")] = 600
     """Control steps that each run counts."""
     impacts: Annotated[int, tyro.conf.arg(metavar="N")] = 0
-    """Instead: N impacts of sheep and shepherds, alone and pushed, on the thinnest walls and small pillars."""
+    """Instead: N impacts of sheep and shepherds, alone and pushed, on thin obstacles of every kind."""
+    obstacles: Annotated[int, tyro.conf.arg(metavar="N")] = 0
+    """Instead: the time outside the engine with N obstacles of all kinds over the same without."""
     engine: bool = False
     """Instead: compare numbers of substeps and iterations by cost, overlap and impacts."""
     campaign: bool = False
@@ -321,7 +324,7 @@ def main(argv: list[str]) -> int:
     """Run the command."""
     try:
         args, _ = parsed(Arguments, PROG, argv)
-        at_least(vars(args), {"runs": 1, "steps": 1, "seeds": 1, "impacts": 0})
+        at_least(vars(args), {"runs": 1, "steps": 1, "seeds": 1, "impacts": 0, "obstacles": 0})
     except SettingsError as error:
         return fail(PROG, error, 2)
     result: Any
@@ -338,6 +341,11 @@ def main(argv: list[str]) -> int:
         result |= {"controller": args.controller, "episodes": args.seeds, "runs": args.runs}
     elif args.engine:
         result = compare_engines(args.runs, args.steps, args.impacts or 5_000)
+    elif args.obstacles:
+        obstacle_cost(args.obstacles, 50, SEED)  # compile everything first
+        costs = [obstacle_cost(args.obstacles, args.steps, SEED + 100 * run) for run in range(args.runs)]
+        result = {key: statistics.median(run[key] for run in costs) for key in costs[0]}
+        result |= {"obstacles": args.obstacles, "runs": args.runs}
     elif args.impacts:
         result = impacts(args.impacts, seed=SEED)
     else:

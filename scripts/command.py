@@ -28,6 +28,8 @@ WANTED = {
     **dict.fromkeys(("flocks", "cohesion", "shepherds"), "whole numbers"),
     **dict.fromkeys(NUMBERS, "a whole number"),
     "timeout": "a number of seconds",
+    "obstacles": "a whole number",
+    "density": "a number",
     "paper-hours": "a number of hours",
 }
 """What a flag takes, for the error that says so."""

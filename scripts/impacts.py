@@ -1,29 +1,46 @@
-"""Impacts of sheep and shepherds on thin walls and small pillars: does anything get through?"""
+"""Impacts of sheep and shepherds on thin walls and small obstacles of every kind: does anything get through?"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pymunk
 
-from shepherd_phys.bodies import SHEEP, Disc
-from shepherd_phys.obstacles import MIN_THICKNESS, Pillar, Wall
+from shepherd_phys.bodies import SHEEP, Body, Disc, built
+from shepherd_phys.geometry import surfaces
+from shepherd_phys.obstacles import MIN_THICKNESS, Box, Fence, Obstacle, Pillar, Polygon, Wall
 from shepherd_phys.scenario import Scenario
 from shepherd_phys.state import Floats, WorldState
 from shepherd_phys.world import World
 
-PILLAR_RADIUS = 0.2
-"""[m]"""
 LANE = 40.0
 """Distance between neighbouring impacts, which must not meet [m]."""
 HALF_WALL = 8.0
 """Half of a wall's length: more than a body slides along it in an impact [m]."""
+RUN_UP = 6.0
+"""Where bodies are put before they are moved on until they nearly touch [m]."""
 STEPS = 12
 """Control steps of an impact: it arrives within 5, then pushes on."""
+REST = 5
+"""Control steps after that in which nobody wants to move."""
+REPEATS = 4
+"""Lanes of each sort in a world."""
 PAIRS = [(front, behind) for front in ("sheep", "shepherd") for behind in (None, "sheep", "shepherd")]
 """Who runs into the obstacle, and who pushes from behind."""
+KINDS: dict[str, Callable[[float], Obstacle]] = {
+    "Wall": lambda y: Wall((0.0, y - HALF_WALL), (0.0, y + HALF_WALL), MIN_THICKNESS),
+    "Pillar": lambda y: Pillar((0.0, y), 0.2),
+    "Box": lambda y: Box((0.0, y), (MIN_THICKNESS, 1.0), 0.3),
+    "Polygon": lambda y: Polygon(((-0.15, y - 0.4), (0.15, y - 0.3), (0.05, y + 0.4))),
+    "Fence": lambda y: Fence((0.0, y - HALF_WALL), (0.0, y + HALF_WALL), gap=0.1, thickness=MIN_THICKNESS),
+}
+"""Obstacles by kind, as thin as they may be, across the lane at a height y; the fence's gap is too narrow for all."""
+ACROSS = ("Wall", "Fence")
+"""Kinds that nobody gets round."""
 
 
 @dataclass
@@ -36,7 +53,7 @@ class _Charge:
         return self.wanted
 
 
-def impacts(count: int, seed: int, **engine: int) -> dict[str, Any]:
+def impacts(count: int, seed: int, shepherd: Body | None = None, **engine: int) -> dict[str, Any]:
     """Run ``count`` impacts at top speed and random angles, spread evenly over kinds, in worlds of many lanes.
 
     A body has tunnelled if at the end of any control step its centre lies inside the obstacle or on its far side.
@@ -44,96 +61,131 @@ def impacts(count: int, seed: int, **engine: int) -> dict[str, Any]:
     Args:
         count: number of impacts, rounded up to whole worlds.
         seed: of the angles and places.
+        shepherd: body of the shepherds; none given: the default disc. It starts with its nose towards the obstacle.
         engine: scenario fields to change (``substeps``, ``iterations``).
 
     Returns:
-        impacts, how many touched the obstacle, how many tunnelled, the deepest overlap with an obstacle while
-        pushed [m], and the seeds of the worlds where something got through.
+        impacts, how many touched the obstacle, how many tunnelled, in all and by kind, the deepest overlap with an
+        obstacle while pushed and when all have come to rest [m], and the seeds of worlds where something got through.
     """
-    lanes = [(pair, kind) for pair in PAIRS for kind in ("wall", "pillar")] * 10
+    lanes = [(pair, kind) for pair in PAIRS for kind in KINDS] * REPEATS
     rng = np.random.default_rng(seed)
-    radius = {"sheep": SHEEP.radius, "shepherd": Disc().radius}
-    speed = {"sheep": SHEEP.max_speed, "shepherd": Disc().max_speed}
-    centers = np.array([[0.0, LANE * k] for k in range(len(lanes))])
-    obstacles = tuple(
-        Wall((x, y - HALF_WALL), (x, y + HALF_WALL), MIN_THICKNESS) if kind == "wall" else Pillar((x, y), PILLAR_RADIUS)
-        for (x, y), (_, kind) in zip(centers.tolist(), lanes, strict=True)
-    )
-    bodies = [(lane, role, who) for lane, (pair, _) in enumerate(lanes) for role, who in enumerate(pair) if who]
-    order = [b for b in bodies if b[2] == "sheep"] + [b for b in bodies if b[2] == "shepherd"]
-    n_sheep = sum(who == "sheep" for _, _, who in bodies)
+    bodies = {"sheep": SHEEP, "shepherd": shepherd or Disc()}
+    reach = {who: built(body, who)[2] for who, body in bodies.items()}
+    roles = [(lane, role, who) for lane, (pair, _) in enumerate(lanes) for role, who in enumerate(pair) if who]
+    order = [r for r in roles if r[2] == "sheep"] + [r for r in roles if r[2] == "shepherd"]
+    n_sheep = sum(who == "sheep" for _, _, who in roles)
     charge = _Charge(np.zeros((n_sheep, 2)))
     scenario = Scenario(
-        n_sheep=n_sheep, n_flocks=1, shepherds=len(order) - n_sheep, flock=charge, obstacles=obstacles
+        n_sheep=n_sheep,
+        n_flocks=1,
+        shepherds=(bodies["shepherd"],) * (len(order) - n_sheep),
+        flock=charge,
+        obstacles=tuple(KINDS[kind](LANE * lane) for lane, (_, kind) in enumerate(lanes)),
     ).but(**engine)
     world = World(scenario)
-    # the template only lends its shape; every position is set below
-    blank = _blank(scenario)
+    blank = _blank(scenario)  # it only lends its shape; every position is set below
     lane_of = np.array([lane for lane, _, _ in order])
+    radius = np.array([reach[who] for _, _, who in order])
+    speed = np.array([bodies[who].max_speed for _, _, who in order])
     is_front = np.array([role == 0 for _, role, _ in order])
-    is_wall = np.array([kind == "wall" for _, kind in lanes])[lane_of]
-    half = np.where(is_wall, MIN_THICKNESS / 2, PILLAR_RADIUS)
-    body_radius = np.array([radius[who] for _, _, who in order])
+    front_of = np.array([int(np.flatnonzero(is_front & (lane_of == lane))[0]) for lane in lane_of])
+    across = np.isin([kind for _, kind in lanes], ACROSS)[lane_of]
+    gap_to = _Gap(scenario.obstacles, lane_of)
 
-    done = touched = tunnelled = 0
-    deepest = 0.0
+    done = touched = 0
+    pushed = rested = 0.0
+    lost = dict.fromkeys(KINDS, 0)
     bad: list[int] = []
     while done < count:
         world_seed = int(rng.integers(2**32))
         draw = np.random.default_rng(world_seed)
-        side = draw.choice([-1.0, 1.0], len(lanes))
-        angle = draw.uniform(-1.4, 1.4, len(lanes))
+        side = draw.choice([-1.0, 1.0], len(lanes))[lane_of]
+        angle = draw.uniform(-1.4, 1.4, len(lanes))[lane_of]
+        aim = draw.uniform(-0.1, 0.1, len(lanes))[lane_of]
+        room = draw.uniform(0.0, 0.6, len(lanes))[lane_of]
         heading = np.stack([-side * np.cos(angle), np.sin(angle)], axis=1)
-        aim = np.zeros((len(lanes), 2))  # where on the obstacle the impact is meant to be
-        aim[:, 1] = np.where([kind == "wall" for _, kind in lanes], 0.0, draw.uniform(-0.1, 0.1, len(lanes)))
-        gap = draw.uniform(0.0, 0.6, len(lanes))
-        pos, wanted = np.empty((len(order), 2)), np.empty((len(order), 2))
-        for i, (lane, role, who) in enumerate(order):
-            front, behind = lanes[lane][0]
-            clear = (PILLAR_RADIUS if lanes[lane][1] == "pillar" else MIN_THICKNESS / 2) + radius[front]
-            back = clear / (math.cos(angle[lane]) if lanes[lane][1] == "wall" else 1.0) + gap[lane]
-            if role == 1 and behind is not None:
-                back += radius[front] + radius[behind] + 1e-3
-            pos[i] = centers[lane] + aim[lane] - back * heading[lane]
-            wanted[i] = heading[lane] * speed[who]
+        pos = np.stack([np.zeros(len(order)), LANE * lane_of + aim], axis=1) - RUN_UP * heading
+        for _ in range(60):  # those in front go on until they nearly touch; the others follow close behind
+            pos += np.maximum(gap_to(pos) - radius - room - 1e-6, 0.0)[:, None] * heading
+        pos = np.where(is_front[:, None], pos, pos[front_of] - (radius[front_of] + radius + 1e-3)[:, None] * heading)
+        wanted = heading * speed[:, None]
         charge.wanted[:] = wanted[:n_sheep]
-        velocity = wanted.copy()  # they arrive at top speed from the first step on
         state = world.reset_to(
             blank.but(
                 sheep_pos=pos[:n_sheep],
-                sheep_vel=velocity[:n_sheep],
+                sheep_vel=wanted[:n_sheep],  # they arrive at top speed from the first step on
                 shepherd_pos=pos[n_sheep:],
-                shepherd_vel=velocity[n_sheep:],
+                shepherd_vel=wanted[n_sheep:],
+                shepherd_angle=np.arctan2(heading[n_sheep:, 1], heading[n_sheep:, 0]),
             ),
             world_seed,
         )
-        action = wanted[n_sheep:] / speed["shepherd"]
         hit, through = np.zeros(len(order), dtype=bool), np.zeros(len(order), dtype=bool)
-        previous = pos - centers[lane_of]
-        for _ in range(STEPS):
-            state = world.step(action)
-            now = np.concatenate([state.sheep_pos, state.shepherd_pos]) - centers[lane_of]
-            away = np.where(is_wall, np.abs(now[:, 0]), np.hypot(now[:, 0], now[:, 1]))
-            # far side: of a wall by the sign of x; of a pillar where one step leads to the opposite of where it was
-            crossed = np.where(is_wall, np.sign(now[:, 0]) != side[lane_of], (now * previous).sum(axis=1) < 0.0)
-            near = away < half + body_radius + 1e-2
-            hit |= near
-            through |= (away < half) | (crossed & (np.abs(now[:, 1]) < HALF_WALL) & (np.abs(previous[:, 0]) < 2.0))
-            deepest = max(deepest, float((half + body_radius - away)[near].max(initial=0.0)))
-            previous = now
+        for step in range(STEPS + REST):
+            if step == STEPS:
+                charge.wanted[:] = 0.0
+            state = world.step(heading[n_sheep:] if step < STEPS else np.zeros((len(order) - n_sheep, 2)))
+            now = np.concatenate([state.sheep_pos, state.shepherd_pos])
+            gap = gap_to(now)
+            hit |= gap < radius + 1e-2
+            beyond = across & (np.sign(now[:, 0]) != side) & (np.abs(now[:, 1] - LANE * lane_of) < HALF_WALL)
+            through |= (gap < 0.0) | beyond | gap_to.crossed(pos, now, gap < 1.0)
+            pushed = max(pushed, _overlap(world.space)) if step < STEPS else pushed
+            pos = now
+        rested = max(rested, _overlap(world.space))
         done += len(lanes)
         touched += len(np.unique(lane_of[hit & is_front]))
-        lost = len(np.unique(lane_of[through]))
-        tunnelled += lost
-        if lost:
+        for lane in np.unique(lane_of[through]).tolist():
+            lost[lanes[lane][1]] += 1
+        if through.any():
             bad.append(world_seed)
     return {
         "impacts": done,
         "touched": touched,
-        "tunnelled": tunnelled,
-        "deepest_overlap_m": deepest,
+        "tunnelled": sum(lost.values()),
+        "tunnelled_by_kind": lost,
+        "deepest_overlap_m": pushed,
+        "deepest_overlap_at_rest_m": rested,
         "bad_world_seeds": bad[:10],
     }
+
+
+class _Gap:
+    """Distances of bodies from the obstacle of their own lane."""
+
+    def __init__(self, obstacles: tuple[Obstacle, ...], lane_of: Any) -> None:
+        self._geometry = surfaces(obstacles)
+        ground = pymunk.Body(body_type=pymunk.Body.STATIC)
+        shapes = [obstacle.shapes(ground) for obstacle in obstacles]
+        self._own = np.repeat(np.arange(len(shapes)), [len(own) for own in shapes])[None] == lane_of[:, None]
+        self._shapes = [shapes[lane] for lane in lane_of]
+        for own in shapes:
+            for shape in own:
+                shape.cache_bb()
+
+    def __call__(self, pos: Floats) -> Floats:
+        """From centres (M, 2) to the surface (M,) [m]."""
+        return np.asarray(np.where(self._own, self._geometry.static_distances(pos)[0], math.inf).min(axis=1))
+
+    def crossed(self, before: Floats, now: Floats, which: Any) -> Any:
+        """Of those asked about, whether the straight way from before to now leads through it (M,)."""
+        crossed = np.zeros(len(now), dtype=bool)
+        for i in which.nonzero()[0]:
+            start, end = tuple(before[i].tolist()), tuple(now[i].tolist())
+            crossed[i] = any(shape.segment_query(start, end) is not None for shape in self._shapes[i])
+        return crossed
+
+
+def _overlap(space: pymunk.Space) -> float:
+    """How deep a moving body is in an obstacle at most [m]."""
+    deepest = 0.0
+    for body in space.bodies:
+        for shape in body.shapes:
+            for hit in space.shape_query(shape):
+                if hit.shape is not None and hit.shape.body is space.static_body:
+                    deepest = max(deepest, *(-point.distance for point in hit.contact_point_set.points))
+    return deepest
 
 
 def _blank(scenario: Scenario) -> WorldState:

@@ -79,6 +79,7 @@ class Point:
         scenario = self.scenario
         controller = find_controller(self.controller)
         things = [controller, scenario.sheep, scenario.flock, *scenario.shepherds, *scenario.obstacles]
+        things += [scenario.layout] if scenario.layout is not None else []
         try:
             return settings_hash(
                 {
@@ -111,7 +112,7 @@ def points(
 
     Args:
         controllers: names, policy files, or ``module:Name`` of a user's own.
-        scenario: a preset's name or a TOML file.
+        scenario: a preset's name, a TOML file, or ``module:Name`` of a scenario or a function that makes one.
         flocks: numbers of flocks.
         cohesion: n, neighbours in the flock model's cohesion.
         shepherds: numbers of shepherds.
@@ -129,7 +130,7 @@ def points(
     body_class = None if body is None else find_class(body, BODIES, "body")
     flock_class = None if flock is None else find_class(flock, FLOCKS, "flock")
     classes = [cls for cls in (body_class, flock_class) if cls is not None]
-    base = load_scenario(scenario, classes)
+    base = find_scenario(scenario, classes)
     if sheep is not None:
         # with the number of flocks, which is checked against it
         base = base.but(n_sheep=sheep, n_flocks=min(base.n_flocks, sheep) if flocks else base.n_flocks)
@@ -262,6 +263,31 @@ def find_controller(name: str) -> Controller:
             "or module:Name of your own"
         )
     return CONTROLLERS[name]()
+
+
+def find_scenario(name: str, classes: Iterable[Any] = ()) -> Scenario:
+    """A scenario by its name, from a TOML file, or ``module:Name`` of one or of a function that makes one.
+
+    Args:
+        name: of it.
+        classes: a user's own classes, for a file that names them.
+
+    Raises:
+        SettingsError: there is none of this name.
+    """
+    if ":" not in name or name.endswith(".toml"):
+        return load_scenario(name, classes)
+    own = imported(name, "scenario")
+    if inspect.isroutine(own):
+        try:
+            own = own()
+        except SettingsError:
+            raise
+        except Exception as error:
+            raise SettingsError(f"scenario: {name}: cannot be made: {explain(error)}") from None
+    if not isinstance(own, Scenario):
+        raise SettingsError(f"scenario: {name}: needs a Scenario (it is a {type(own).__name__})")
+    return own
 
 
 def find_class(name: str, known: dict[str, type[Any]], where: str) -> type[Any]:

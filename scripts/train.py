@@ -16,9 +16,12 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+from shepherd_phys.layouts import Scattered
 from shepherd_phys.learning.folder import BEST, CURVE, POLICY, PRESET, VALIDATION, agree, begin
 from shepherd_phys.learning.preset import Preset, load_preset
-from shepherd_phys.settings import SettingsError
+from shepherd_phys.scenario import load_scenario
+from shepherd_phys.settings import SettingsError, kind_of
+from shepherd_phys.world import World
 
 from .command import LOG_SECONDS, at_least, clock, cpu_count, fail, flag, parsed
 
@@ -45,9 +48,15 @@ class Train:
     """Shepherd-steps (control steps times shepherds) to train for; a run ends with a whole checkpoint interval."""
     init: Annotated[str | None, flag("NAME|FILE", "the preset's")] = None
     """Policy to start from: a shipped one's name or a .json file."""
+    scenario: Annotated[str | None, flag("NAME|FILE", "the preset's")] = None
+    """Scenario; where its flocks are is its own, and not the preset's, then."""
+    obstacles: Annotated[int | None, flag("COUNT", "the scenario's")] = None
+    """Discs of radius 1 m, drawn anew for each episode: so many."""
+    density: Annotated[float | None, flag("FRACTION", "the scenario's")] = None
+    """The same, given as the part of the box's area that they cover."""
     workers: Annotated[int, flag("W")] = cpu_count()
     """Processes for the worlds; the results do not depend on it."""
-    out: Annotated[Path | None, flag("DIR", "runs/PRESET-REWARD-SEED")] = None
+    out: Annotated[Path | None, flag("DIR", "runs/PRESET-REWARD-SEED..")] = None
     """Folder of the run."""
     resume: tyro.conf.FlagCreatePairsOff[bool] = False
     """Go on with the run in --out."""
@@ -61,7 +70,7 @@ def main(argv: Sequence[str]) -> int:
     """Run the command; the exit status: 0, 1 if training had to stop, 2 for a mistake of the user, 130 for Ctrl-C."""
     try:
         options, flags = parsed(Train, PROG, argv)
-        at_least(vars(options), {"seed": 0, "budget": 1, "workers": 1})
+        at_least(vars(options), {"seed": 0, "budget": 1, "obstacles": 0, "workers": 1})
         check_libraries()
         folder, preset = prepare(options, flags)
     except SettingsError as error:
@@ -102,7 +111,6 @@ def prepare(options: Train, given: set[str]) -> tuple[Path, Preset]:
     Raises:
         SettingsError: the folder holds another run, or none to resume; or the preset is impossible.
     """
-    changes = {name: getattr(options, name) for name in FROM_PRESET if name in given}
     if options.resume:
         if options.out is None:
             raise SettingsError("--resume needs --out, the folder of the run")
@@ -110,17 +118,43 @@ def prepare(options: Train, given: set[str]) -> tuple[Path, Preset]:
             raise SettingsError(f"{options.out}: holds no run to resume (no {PRESET})")
         preset = Preset.from_toml(options.out / PRESET)
         wanted = load_preset(options.preset) if "preset" in given else preset
-        changed = wanted.but(**{"budget": preset.budget, **changes})
+        changed = asked(wanted.but(budget=preset.budget), options, given)
         try:
             agree(options.out, changed)
         except SettingsError as error:
             raise SettingsError(f"{error}; --resume needs none but --out") from None
         return options.out, changed  # `train` writes it, once nobody else is at the run
-    preset = load_preset(options.preset).but(**changes)
-    folder = options.out or Path("runs") / f"{Path(options.preset).stem}-{preset.reward}-{preset.seed}"
-    preset.start()  # before a folder is made that the next attempt would find
+    preset = asked(load_preset(options.preset), options, given)
+    words = [Path(options.preset).stem, preset.reward, str(preset.seed)]
+    words += [Path(options.scenario).stem] if options.scenario is not None else []
+    words += [f"{name}{getattr(options, name):g}" for name in ("obstacles", "density") if name in given]
+    folder = options.out or Path("runs") / "-".join(words)
+    # before a folder is made that the next attempt would find
+    preset.start()
+    if preset.scenario.has_obstacles:
+        World(preset.scenario).reset(preset.seed)  # whether there is room for them
     begin(folder, preset)
     return folder, preset
+
+
+def asked(preset: Preset, options: Train, given: set[str]) -> Preset:
+    """The preset with what the flags change.
+
+    Raises:
+        SettingsError: a flag's value is impossible, or two of them do not go together.
+    """
+    preset = preset.but(**{name: getattr(options, name) for name in FROM_PRESET if name in given})
+    if options.scenario is not None:
+        preset = preset.but(scenario=load_scenario(options.scenario), flock_distance=None)
+    if options.obstacles is None and options.density is None:
+        return preset
+    if options.obstacles is not None and options.density is not None:
+        raise SettingsError("--obstacles and --density: both say how many obstacles there are; leave one of them out")
+    layout = preset.scenario.layout or Scattered(count=0)
+    if not isinstance(layout, Scattered):
+        raise SettingsError(f"--obstacles, --density: the scenario has a layout of its own, {kind_of(layout)}")
+    layout = layout.but(count=options.obstacles, density=options.density)
+    return preset.but(scenario=preset.scenario.but(layout=layout))
 
 
 @contextlib.contextmanager

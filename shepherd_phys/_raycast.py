@@ -11,21 +11,23 @@ from shepherd_phys._shapes import (
     DISC,
     GOAL,
     OBSTACLES,
-    SEGMENT,
+    POLYGON,
     SHEEP,
     Bools,
     Floats,
     Ints,
     Shapes,
+    cap_alpha,
     disc_alpha,
     misses_box,
-    polygon_alpha,
     segment_alpha,
     surface_distance,
 )
 
 _MARGIN = 1e-3
-"""[rad]. Beams this far beside a shape are tried too: more than `_angle` errs or rounding can move an edge."""
+"""[rad]. Beams this far beside a shape are tried too: more than two of `_angle` err or rounding can move an edge."""
+_INSIDE = 1e-6
+"""[m]. A hit this far inside a bounding box is one of a beam that meets the box, however its sides are rounded."""
 
 
 @njit(cache=True, error_model="numpy")
@@ -84,11 +86,11 @@ def _covered(shapes: Shapes, s: int, x: float, y: float, beams: int) -> tuple[in
     for i in range(first, first + count):
         dx, dy = corners[i, 0] - x, corners[i, 1] - y
         half = _half_width(dx * dx + dy * dy - r * r, r)
-        turn = math.atan2(mx * dy - my * dx, mx * dx + my * dy)
+        turn = _angle(mx * dy - my * dx, mx * dx + my * dy)
         low, high = min(low, turn - half), max(high, turn + half)
     if high - low > math.pi - 0.1:  # close by, where rounding could turn a corner to the other side
         return 0, beams - 1
-    middle = math.atan2(my, mx)
+    middle = _angle(my, mx)
     return _beams_between(middle + low, middle + high, beams)
 
 
@@ -124,13 +126,54 @@ def _cast(
     r = shapes.radius[s]
     if kind == DISC:
         _cast_disc(hit, corners[first_corner, 0], corners[first_corner, 1], r, x, y, directions, reach, first, last)
-        return
-    for k in range(first, last + 1):
-        bx, by = x + reach * directions[0, k], y + reach * directions[1, k]
-        if kind == SEGMENT:
+    elif kind == POLYGON:
+        _cast_polygon(hit, corners, first_corner, count, r, x, y, directions, reach, first, last)
+    else:
+        for k in range(first, last + 1):
+            bx, by = x + reach * directions[0, k], y + reach * directions[1, k]
             t = segment_alpha(corners, first_corner, r, x, y, bx, by)
-        else:
-            t = polygon_alpha(corners, first_corner, count, r, x, y, bx, by)
+            hit[k] = t * reach if t < 1.0 else math.inf
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _cast_polygon(
+    hit: Floats,
+    corners: Floats,
+    first_corner: int,
+    count: int,
+    r: float,
+    x: float,
+    y: float,
+    directions: Floats,
+    reach: float,
+    first: int,
+    last: int,
+) -> None:
+    """`_cast` for a convex polygon with rounded corners: edge by edge, for what does not hang on the beam."""
+    hit[first : last + 1] = 1.0
+    before = first_corner + count - 1
+    for i in range(first_corner, first_corner + count):
+        vx, vy, nx, ny = corners[i, 0], corners[i, 1], corners[i, 2], corners[i, 3]
+        an = x * nx + y * ny
+        d = an - (vx * nx + vy * ny) - r
+        if d >= 0.0:
+            low, high = nx * corners[before, 1] - ny * corners[before, 0], nx * vy - ny * vx
+            for k in range(first, last + 1):
+                bx, by = x + reach * directions[0, k], y + reach * directions[1, k]
+                bn = bx * nx + by * ny
+                if not (-1e-5 < an - bn < 1e-5):  # Chipmunk's own threshold for a beam along an edge
+                    t = d / (an - bn)
+                    if 0.0 <= t <= 1.0:
+                        px, py = x * (1.0 - t) + bx * t, y * (1.0 - t) + by * t
+                        if low <= nx * py - ny * px <= high:
+                            hit[k] = t
+        before = i
+    for k in range(first, last + 1):
+        t = hit[k]
+        if r > 0.0:
+            bx, by = x + reach * directions[0, k], y + reach * directions[1, k]
+            for i in range(first_corner, first_corner + count):
+                t = min(t, cap_alpha(corners[i, 0], corners[i, 1], r, x, y, bx, by))
         hit[k] = t * reach if t < 1.0 else math.inf
 
 
@@ -139,7 +182,10 @@ def _outside_box(
     hit: Floats, box: Floats, x: float, y: float, directions: Floats, reach: float, first: int, last: int
 ) -> None:
     """Turn hits of beams that miss the bounding box into none; the arguments are those of `_cast`."""
+    left, bottom, right, top = box[0] + _INSIDE, box[1] + _INSIDE, box[2] - _INSIDE, box[3] - _INSIDE
     for k in range(first, last + 1):
+        if left < x + hit[k] * directions[0, k] < right and bottom < y + hit[k] * directions[1, k] < top:
+            continue
         if hit[k] < math.inf and misses_box(box, x, y, x + reach * directions[0, k], y + reach * directions[1, k]):
             hit[k] = math.inf
 

@@ -112,7 +112,7 @@ def disc_alpha(cx: float, cy: float, r: float, ax: float, ay: float, bx: float, 
 
 
 @njit(cache=True, error_model="numpy")
-def _cap_alpha(cx: float, cy: float, r: float, ax: float, ay: float, bx: float, by: float) -> float:
+def cap_alpha(cx: float, cy: float, r: float, ax: float, ay: float, bx: float, by: float) -> float:
     """As `disc_alpha`, 1 where the disc is not hit."""
     t = disc_alpha(cx, cy, r, ax, ay, bx, by)
     return t if 0.0 <= t <= 1.0 else 1.0
@@ -134,32 +134,7 @@ def segment_alpha(corners: Floats, first: int, r: float, ax: float, ay: float, b
         return ad / (ad - bd) if ad * bd < 0.0 else 1.0
     if r == 0.0:
         return 1.0
-    return min(_cap_alpha(ux, uy, r, ax, ay, bx, by), _cap_alpha(vx, vy, r, ax, ay, bx, by))
-
-
-@njit(cache=True, error_model="numpy")
-def polygon_alpha(
-    corners: Floats, first: int, count: int, r: float, ax: float, ay: float, bx: float, by: float
-) -> float:
-    """Share of the way a-b at which it enters a convex polygon with rounded corners; 1 where it does not."""
-    alpha = 1.0
-    before = first + count - 1
-    for i in range(first, first + count):
-        vx, vy, nx, ny = corners[i, 0], corners[i, 1], corners[i, 2], corners[i, 3]
-        an, bn = ax * nx + ay * ny, bx * nx + by * ny
-        d = an - (vx * nx + vy * ny) - r
-        if d >= 0.0 and not (-1e-5 < an - bn < 1e-5):  # Chipmunk's own threshold for a beam along an edge
-            t = d / (an - bn)
-            if 0.0 <= t <= 1.0:
-                px, py = ax * (1.0 - t) + bx * t, ay * (1.0 - t) + by * t
-                along = nx * py - ny * px
-                if nx * corners[before, 1] - ny * corners[before, 0] <= along <= nx * vy - ny * vx:
-                    alpha = t
-        before = i
-    if r > 0.0:
-        for i in range(first, first + count):
-            alpha = min(alpha, _cap_alpha(corners[i, 0], corners[i, 1], r, ax, ay, bx, by))
-    return alpha
+    return min(cap_alpha(ux, uy, r, ax, ay, bx, by), cap_alpha(vx, vy, r, ax, ay, bx, by))
 
 
 @njit(cache=True, error_model="numpy")

@@ -10,6 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
+from shepherd_phys.avoidance import Avoidance
 from shepherd_phys.neighbours import GRID_FROM, surroundings
 from shepherd_phys.settings import Settings, settings
 from shepherd_phys.state import WorldState
@@ -42,11 +43,12 @@ class Strombom(Settings):
     A sheep is threatened while any shepherd is within r_s. Otherwise it grazes: it stands still, and with probability
     p makes one step in a uniformly random direction. A threatened sheep at A_i with heading H_i moves along
 
-        H' = h H_i + c C_i + rho_a R_a + rho_s R_s + e eps,    v* = speed H' / |H'|
+        H' = h H_i + c C_i + rho_a R_a + rho_s R_s + e eps + O_i,    v* = speed H' / |H'|
 
     where C_i points to the mean position of the n nearest others, R_a is the normalised sum of unit(A_i - A_j) over
     sheep nearer than r_a, R_s that of unit(A_i - S_j) over shepherds within r_s, and eps a unit vector in a
-    uniformly random direction. A term of length 0 is 0; if H' is 0 the heading stays.
+    uniformly random direction. O_i, which the 2014 sheep do not have, is the push away from obstacles (`Avoidance`), no
+    unit vector. A term of length 0 is 0; if H' is 0 the heading stays.
 
     Weights, p: the 2014 values. The paper's many shepherds are summed as here by its successors.
     """
@@ -69,6 +71,8 @@ class Strombom(Settings):
     """n [sheep], at any distance, clipped to N - 1; the perception-based rewards paper varies it from 10 to 85."""
     graze_probability: float = Field(default=0.05, ge=0, le=1)
     """p per control step [1] (2014)."""
+    avoidance: Avoidance = Avoidance()
+    """O, how a threatened sheep feels obstacles."""
 
     def velocities(self, state: WorldState, rng: np.random.Generator) -> Floats:
         """Desired velocities (N, 2) [m/s].
@@ -81,7 +85,7 @@ class Strombom(Settings):
             state.sheep_pos, state.sheep_heading, state.sheep_max_speed, state.shepherd_pos, draws,
             self.inertia, self.attraction, self.repulsion, self.flight, self.noise,
             self.detection_radius, self.sheep_distance, self.n_neighbours, self.graze_probability,
-            state.n_sheep >= GRID_FROM,
+            state.n_sheep >= GRID_FROM, self.avoidance.pushes(state),
         )  # fmt: skip
 
 
@@ -124,7 +128,7 @@ def flight(sheep: Floats, shepherds: Floats, r_s: float) -> tuple[NDArray[np.boo
 def desired(
     sheep: Floats, heading: Floats, speed: Floats, shepherds: Floats, draws: Floats,
     h: float, c: float, rho_a: float, rho_s: float, e: float, r_s: float, r_a: float, n: int, p: float,
-    use_grid: bool,
+    use_grid: bool, pushed: Floats,
 ) -> Floats:  # fmt: skip
     """The rule of `Strombom`, for the whole flock at once.
 
@@ -144,6 +148,7 @@ def desired(
         n: neighbours.
         p: probability of a step while grazing.
         use_grid: find neighbours through a grid; the same neighbours, faster for large flocks.
+        pushed: (N, 2) O_i; (0, 2) where there are no obstacles.
 
     Returns:
         (N, 2) v* [m/s].
@@ -165,6 +170,9 @@ def desired(
         sx, sy = _unit(away[i, 0], away[i, 1])
         x = h * heading[i, 0] + c * cx + rho_a * ax + rho_s * sx + e * math.cos(angle)
         y = h * heading[i, 1] + c * cy + rho_a * ay + rho_s * sy + e * math.sin(angle)
+        if len(pushed) > 0:
+            x += pushed[i, 0]
+            y += pushed[i, 1]
         if x == 0.0 and y == 0.0:
             x, y = heading[i, 0], heading[i, 1]
         ux, uy = _unit(x, y)

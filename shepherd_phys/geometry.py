@@ -21,7 +21,7 @@ from shepherd_phys._shapes import (
     surface_distance,
     surface_distances,
 )
-from shepherd_phys.state import frozen
+from shepherd_phys.obstacles import Obstacle, solid
 
 __all__ = [
     "DISC",
@@ -39,6 +39,7 @@ __all__ = [
     "Shapes",
     "compile_shapes",
     "surface_distance",
+    "surfaces",
 ]
 
 SHEEP_CATEGORY = 1
@@ -142,17 +143,27 @@ def compile_shapes(shapes: Iterable[Owned]) -> Geometry:
         corners.extend(own)
     rows = np.array(table, np.int64).reshape(-1, 5)
     static = np.flatnonzero(rows[:, 1] < 0).astype(np.int64)
-    return Geometry(
-        shapes=Shapes(
-            table=frozen(rows),
-            radius=frozen(np.array(radius, np.float64)),
-            corners=frozen(np.array(corners, np.float64).reshape(-1, 4)),
-            boxes=frozen(np.array(boxes, np.float64).reshape(-1, 4)),
-            boxed=len(static) > 1,
-        ),
-        static=frozen(static),
-        unknown=tuple(unknown),
-        has_obstacles=has_obstacles,
+    arrays = Shapes(
+        table=rows,
+        radius=np.array(radius, np.float64),
+        corners=np.array(corners, np.float64).reshape(-1, 4),
+        boxes=np.array(boxes, np.float64).reshape(-1, 4),
+        boxed=len(static) > 1,
+    )
+    for array in (*arrays[:4], static):
+        array.setflags(write=False)
+    return Geometry(arrays, static, tuple(unknown), has_obstacles)
+
+
+def surfaces(obstacles: Iterable[Obstacle]) -> Geometry:
+    """Obstacles compiled, apart from any world.
+
+    Raises:
+        SettingsError: one of them is none; the message names it.
+    """
+    body = pymunk.Body(body_type=pymunk.Body.STATIC)
+    return compile_shapes(
+        (shape, -1, OBSTACLES) for i, obstacle in enumerate(obstacles) for shape in solid(obstacle, i, body)
     )
 
 

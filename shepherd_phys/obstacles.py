@@ -20,6 +20,9 @@ MIN_THICKNESS = 0.1
 """[m]. At the default substep nothing gets through a wall this thick; thinner ones are refused."""
 
 
+Side = Annotated[float, Field(ge=MIN_THICKNESS)]
+
+
 @runtime_checkable
 class Obstacle(Protocol):
     """Something solid that does not move."""
@@ -103,7 +106,63 @@ class Polygon(Settings):
         return [pymunk.Poly(body, list(self.vertices))]
 
 
-OBSTACLES: dict[str, type[Any]] = {"Wall": Wall, "Pillar": Pillar, "Polygon": Polygon}
+@settings
+class Box(Settings):
+    """A rectangle."""
+
+    center: Point
+    """[m]"""
+    size: tuple[Side, Side] = (1.0, 1.0)
+    """Lengths of its sides, along its own x and y axis [m]."""
+    angle: float = 0.0
+    """Of its own x axis from the world's [rad]."""
+
+    def shapes(self, body: pymunk.Body) -> list[pymunk.Shape]:
+        """One polygon."""
+        (x, y), (width, height) = self.center, self.size
+        cos, sin = math.cos(self.angle), math.sin(self.angle)
+        half = [(sx * width / 2, sy * height / 2) for sx, sy in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+        return [pymunk.Poly(body, [(x + cos * u - sin * v, y + sin * u + cos * v) for u, v in half])]
+
+
+@settings
+class Fence(Settings):
+    """A straight wall with a gap."""
+
+    start: Point
+    end: Point
+    """Ends of its centre line [m]."""
+    gap: float = Field(gt=0)
+    """Free width between the two parts [m]."""
+    at: float | None = Field(default=None, gt=0)
+    """Distance of the gap's middle from the start [m]; none given: half-way."""
+    thickness: float = Field(default=0.1, ge=MIN_THICKNESS)
+    """[m]"""
+
+    def __post_init__(self) -> None:
+        before, behind = self._ends()
+        if not (before > 0 and behind < math.dist(self.start, self.end)):
+            raise ValueError(
+                "gap: something of the fence must be left on both sides "
+                f"(given: gap {self.gap}, at {self.at}, length {math.dist(self.start, self.end):.6g})"
+            )
+
+    def _ends(self) -> tuple[float, float]:
+        """Where the centre line breaks off and goes on, from the start [m]; the ends are round."""
+        middle = math.dist(self.start, self.end) / 2 if self.at is None else self.at
+        half = (self.gap + self.thickness) / 2
+        return middle - half, middle + half
+
+    def shapes(self, body: pymunk.Body) -> list[pymunk.Shape]:
+        """Two segments."""
+        length = math.dist(self.start, self.end)
+        (ax, ay), (bx, by) = self.start, self.end
+        left, right = ((ax + (bx - ax) * t / length, ay + (by - ay) * t / length) for t in self._ends())
+        radius = self.thickness / 2
+        return [pymunk.Segment(body, self.start, left, radius), pymunk.Segment(body, right, self.end, radius)]
+
+
+OBSTACLES: dict[str, type[Any]] = {"Wall": Wall, "Pillar": Pillar, "Box": Box, "Polygon": Polygon, "Fence": Fence}
 """The library's obstacles by name, for files."""
 
 

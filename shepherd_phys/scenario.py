@@ -10,11 +10,14 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field
 
+from shepherd_phys.avoidance import Avoidance
 from shepherd_phys.bodies import BODIES, SHEEP, Body, Disc
 from shepherd_phys.flock import FLOCKS, FlockModel, Strombom
+from shepherd_phys.layouts import LAYOUTS, Corridor, Fenced, Lattice, Layout, Scattered
 from shepherd_phys.lidar import CHANNELS, Channel
 from shepherd_phys.obstacles import OBSTACLES, Obstacle
 from shepherd_phys.settings import (
+    Foreign,
     Settings,
     SettingsError,
     handed_over,
@@ -29,6 +32,8 @@ SUCCESS_FRACTION = 0.95
 """An episode succeeds with this fraction of the sheep in the goal."""
 OPEN_SUBSTEPS = 2
 """In a control step of an open world: with one, driven sheep run right through one another (measured)."""
+GOAL_KEEP_OUT, BODY_KEEP_OUT = 2.0, 0.5
+"""[m]"""
 OBSTACLE_SUBSTEPS = 3
 """The same among obstacles: with two, a shepherd squeezes one sheep in a hundred through a thin wall (measured)."""
 
@@ -74,6 +79,8 @@ class Scenario(Settings):
         tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]], BeforeValidator(_interval)
     ] = (10.0, 20.0)
     """Least and largest distance of a flock's centre from the goal's centre, drawn uniformly [m]."""
+    flock_spread: float | None = Field(default=None, ge=0, le=math.pi)
+    """All flocks' centres lie within this angle of one drawn direction from the goal [rad]; none: anywhere."""
     flock_sd: float = Field(default=1.0, gt=0)
     """Standard deviation of a flock's members about its centre, each axis [m]."""
     box: float = Field(default=50.0, gt=0)
@@ -89,7 +96,13 @@ class Scenario(Settings):
     flock: Any = Strombom()
     """How sheep move: a flock model."""
     obstacles: tuple[Any, ...] = ()
-    """Solid, static things."""
+    """Solid, static things, the same in every episode."""
+    layout: Any = None
+    """Draws further obstacles anew at each reset, from a random stream of its own: a `Layout`, or none."""
+    goal_keep_out: float = Field(default=GOAL_KEEP_OUT, ge=0)
+    """Obstacles of a layout keep this far from the goal's border [m]."""
+    body_keep_out: float = Field(default=BODY_KEEP_OUT, ge=0)
+    """Where a layout draws, every body starts at least this far from any obstacle [m]."""
     n_steps: int = Field(default=1000, ge=1)
     """T: control steps of an episode; the nominal length in every formula."""
     control_dt: float = Field(default=0.2, gt=0)
@@ -108,6 +121,8 @@ class Scenario(Settings):
     """End the episode when 95 % of the sheep have been in the goal for 5 s on end."""
 
     def __post_init__(self) -> None:
+        if not (self.layout is None or callable(self.layout) or isinstance(self.layout, Foreign)):
+            raise ValueError(f"layout: needs a layout that can be called, or None (given: {self.layout!r})")
         if self.n_flocks > self.n_sheep:
             raise ValueError(f"n_flocks is {self.n_flocks}, more than there are sheep ({self.n_sheep})")
         if self.flock_sizes is not None and (len(self.flock_sizes), sum(self.flock_sizes)) != (
@@ -125,14 +140,19 @@ class Scenario(Settings):
         return len(self.shepherds)
 
     @property
+    def has_obstacles(self) -> bool:
+        """Whether its worlds can have obstacles, whatever is drawn."""
+        return bool(self.obstacles) or self.layout is not None
+
+    @property
     def channels(self) -> tuple[Channel, ...]:
         """What shepherds observe here unless somebody says otherwise: obstacles where there are some."""
-        return CHANNELS if self.obstacles else CHANNELS[:3]
+        return CHANNELS if self.has_obstacles else CHANNELS[:3]
 
     @property
     def n_substeps(self) -> int:
         """Engine steps in a control step."""
-        return self.substeps or (OBSTACLE_SUBSTEPS if self.obstacles else OPEN_SUBSTEPS)
+        return self.substeps or (OBSTACLE_SUBSTEPS if self.has_obstacles else OPEN_SUBSTEPS)
 
     @property
     def physics_dt(self) -> float:
@@ -146,6 +166,17 @@ class Scenario(Settings):
         table["sheep"] = tagged(self.sheep)
         table["flock"] = tagged(self.flock)
         table["obstacles"] = [tagged(obstacle) for obstacle in self.obstacles]
+        if self.layout is not None:
+            table["layout"] = tagged(self.layout)
+        if not self.has_obstacles:
+            # an open world is written as it was before there were obstacles to feel: results are known by this table
+            for part, name, usual in (
+                (table, "goal_keep_out", GOAL_KEEP_OUT),
+                (table, "body_keep_out", BODY_KEEP_OUT),
+                (table["flock"], "avoidance", Avoidance().to_dict()),
+            ):
+                if part.get(name) == usual:
+                    del part[name]
         return table
 
     @classmethod
@@ -154,7 +185,8 @@ class Scenario(Settings):
 
         Args:
             table: what `to_dict` gives, or parts of it.
-            classes: a user's own classes of bodies, flock models and obstacles; nothing is ever imported by name.
+            classes: a user's own classes of bodies, flock models, obstacles and layouts; nothing is ever imported by
+                name.
 
         Raises:
             SettingsError: a field is unknown or impossible.
@@ -176,6 +208,8 @@ class Scenario(Settings):
                 untagged(thing, OBSTACLES | own, f"Scenario.obstacles[{i}]")
                 for i, thing in enumerate(values["obstacles"])
             )
+        if "layout" in values:
+            values["layout"] = untagged(values["layout"], LAYOUTS | own, "Scenario.layout")
         return cls(**values)
 
     def to_toml(self, path: str | Path) -> None:
@@ -193,9 +227,13 @@ SCENARIOS: dict[str, Scenario] = {
     "single": Scenario(n_flocks=1),
     "double": Scenario(n_sheep=200, goal_radius=2.5 * math.sqrt(2.0)),
     "small": Scenario(n_sheep=20, n_flocks=2, shepherds=2, flock=Strombom(n_neighbours=8), n_steps=500),
+    "fence": Scenario(layout=Fenced(), flock_spread=math.pi / 6, flock_distance=(14.0, 20.0)),
+    "corridor": Scenario(layout=Corridor(), flock_spread=math.pi / 6, flock_distance=(14.0, 20.0)),
+    "lattice": Scenario(layout=Lattice()),
+    "scattered": Scenario(layout=Scattered(density=0.01)),
 }
 """Presets by name: the paper's world; one flock; twice the sheep with a goal of twice the area; a small one for quick
-looks."""
+looks; and the paper's world with obstacles, drawn anew for each episode."""
 
 
 def load_scenario(name_or_path: str | Path, classes: Iterable[Any] = ()) -> Scenario:
@@ -211,4 +249,4 @@ def load_scenario(name_or_path: str | Path, classes: Iterable[Any] = ()) -> Scen
     raise SettingsError(f"scenario: {str(name_or_path)!r} is neither a .toml file nor one of {', '.join(SCENARIOS)}")
 
 
-__all__ = ["SCENARIOS", "Body", "FlockModel", "Obstacle", "Scenario", "load_scenario"]
+__all__ = ["SCENARIOS", "Body", "FlockModel", "Layout", "Obstacle", "Scenario", "load_scenario"]

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from shepherd_phys.geometry import Geometry, surfaces
 from shepherd_phys.obstacles import Obstacle
 
 Floats = NDArray[np.float64]
@@ -74,6 +76,14 @@ class WorldState:
     def n_shepherds(self) -> int:
         """P."""
         return len(self.shepherd_pos)
+
+    @cached_property
+    def surroundings(self) -> Geometry:
+        """The obstacles as surfaces: distances from points, and shapes for kernels.
+
+        The world's states share one for the whole episode.
+        """
+        return surfaces(self.obstacles)
 
     @classmethod
     def of(cls, values: dict[str, Any]) -> WorldState:

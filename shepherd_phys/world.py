@@ -28,8 +28,9 @@ from shepherd_phys.geometry import (
     Geometry,
     compile_shapes,
 )
+from shepherd_phys.layouts import Site, laid_out
 from shepherd_phys.lidar import Lidar, Scan, Sensor
-from shepherd_phys.obstacles import solid
+from shepherd_phys.obstacles import Obstacle, solid
 from shepherd_phys.placement import PlacementError, flock_of, place, relax
 from shepherd_phys.scenario import Scenario
 from shepherd_phys.settings import Foreign, SettingsError, kind_of
@@ -98,7 +99,7 @@ class World:
     """
 
     def __init__(self, scenario: Scenario) -> None:
-        for thing in (*scenario.shepherds, scenario.sheep, scenario.flock, *scenario.obstacles):
+        for thing in (*scenario.shepherds, scenario.sheep, scenario.flock, *scenario.obstacles, scenario.layout):
             if isinstance(thing, Foreign):
                 raise thing.missing()
             if isinstance(thing, type):
@@ -136,8 +137,13 @@ class World:
         scenario = self.scenario
         self._state = None  # a reset that fails leaves no half-made world to step
         placement = self._seed(seed)
-        bodies, static = self._new_bodies()
+        bodies, static = self._new_bodies(scenario.obstacles)
+        radius = np.array([reach for _, _, reach in bodies])
         solids = compile_shapes([(shape, -1, OBSTACLES) for shape, _ in static])
+        direction, bearing = None, (0.0, 2.0 * math.pi)
+        if scenario.flock_spread is not None:
+            direction = 2.0 * math.pi * float(self._drawing.random())
+            bearing = direction - scenario.flock_spread, direction + scenario.flock_spread
         for _ in range(PLACE_TRIES):
             goal, sheep_pos, shepherd_pos = place(
                 placement,
@@ -145,6 +151,7 @@ class World:
                 n_flocks=scenario.n_flocks,
                 flock_sizes=scenario.flock_sizes,
                 flock_distance=scenario.flock_distance,
+                flock_bearing=bearing,
                 flock_sd=scenario.flock_sd,
                 n_shepherds=self._p,
                 box=scenario.box,
@@ -159,14 +166,31 @@ class World:
             )
         pos = relax(
             np.concatenate([sheep_pos, shepherd_pos]),
-            np.array([reach for _, _, reach in bodies]),
+            radius,
             push_out=solids.push_out if static else None,
         )
+        obstacles = scenario.obstacles
+        if scenario.layout is not None:
+            site = Site(
+                box=scenario.box,
+                goal_pos=goal,
+                goal_radius=scenario.goal_radius,
+                direction=direction,
+                body_pos=pos,
+                body_radius=radius,
+                goal_keep_out=scenario.goal_keep_out,
+                body_keep_out=scenario.body_keep_out,
+                fixed=obstacles,
+            )
+            drawn, pos = laid_out(scenario.layout, self._drawing, site)
+            obstacles = (*obstacles, *drawn)
+            static = self._shapes_of(obstacles)
         angle = self._noise.uniform(0.0, 2 * np.pi, self._n)
         motion = np.zeros((self._n + self._p, 6))
         motion[:, :2] = pos
         return self._start(
             bodies,
+            obstacles,
             static,
             goal,
             motion,
@@ -189,7 +213,8 @@ class World:
 
         Args:
             state: where everything is, how it moves and which sheep have arrived; its clock and what it has counted
-                are not taken over. Make one with ``world.reset(0).but(sheep_pos=..)``.
+                are not taken over, its obstacles only where the scenario has a layout. Make one with
+                ``world.reset(0).but(sheep_pos=..)``.
             seed: of the sheep's noise and of ``user_rng``.
 
         Raises:
@@ -218,23 +243,28 @@ class World:
                 raise NonFiniteError(f"state.{name}: every number must be finite")
         self._state = None
         self._seed(seed)
-        bodies, static = self._new_bodies()
+        # where a layout draws, the arrangement's own obstacles are a part of it
+        obstacles = self.scenario.obstacles if self.scenario.layout is None else state.obstacles
+        bodies, static = self._new_bodies(obstacles)
         motion = np.zeros((self._n + self._p, 6))
         motion[:, :2] = np.concatenate([state.sheep_pos, state.shepherd_pos])
         motion[self._n :, 2] = state.shepherd_angle
         motion[:, 3:5] = np.concatenate([state.sheep_vel, state.shepherd_vel])
-        return self._start(bodies, static, state.goal_pos, motion, state.sheep_heading, state.sheep_arrived)
+        return self._start(bodies, obstacles, static, state.goal_pos, motion, state.sheep_heading, state.sheep_arrived)
 
     def _seed(self, seed: int) -> np.random.Generator:
-        """Seed the sheep's noise and the users' stream; the stream of the placement is returned."""
+        """Seed the sheep's noise, the layout's stream and the users'; the stream of the placement is returned."""
         if not isinstance(seed, int | np.integer) or seed < 0:
             raise ValueError(f"seed: needs a whole number that is not negative (given: {seed!r})")
-        placement, noise, users = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(3))
+        placement, noise, users, drawing = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4))
         self._noise = noise
+        self._drawing = drawing
         self.user_rng = users
         return placement
 
-    def _new_bodies(self) -> tuple[list[tuple[pymunk.Body, list[pymunk.Shape], float]], list[tuple[pymunk.Shape, int]]]:
+    def _new_bodies(
+        self, obstacles: tuple[Obstacle, ...]
+    ) -> tuple[list[tuple[pymunk.Body, list[pymunk.Shape], float]], list[tuple[pymunk.Shape, int]]]:
         """A fresh Space, the bodies for it in their fixed order, and shapes of obstacles with the obstacle's index."""
         scenario = self.scenario
         space = pymunk.Space()
@@ -243,16 +273,20 @@ class World:
         self.space = space
         bodies = [built(scenario.sheep, "sheep") for _ in range(self._n)]
         bodies += [built(body, f"shepherd {k}") for k, body in enumerate(scenario.shepherds)]
-        static = [
+        return bodies, self._shapes_of(obstacles)
+
+    def _shapes_of(self, obstacles: tuple[Obstacle, ...]) -> list[tuple[pymunk.Shape, int]]:
+        """Shapes of obstacles for the Space, each with its obstacle's index."""
+        return [
             (shape, index)
-            for index, obstacle in enumerate(scenario.obstacles)
-            for shape in solid(obstacle, index, space.static_body)
+            for index, obstacle in enumerate(obstacles)
+            for shape in solid(obstacle, index, self.space.static_body)
         ]
-        return bodies, static
 
     def _start(
         self,
         bodies: list[tuple[pymunk.Body, list[pymunk.Shape], float]],
+        obstacles: tuple[Obstacle, ...],
         static: list[tuple[pymunk.Shape, int]],
         goal: Floats,
         motion: Floats,
@@ -301,7 +335,8 @@ class World:
             "sheep_max_speed": self._sheep_speed,
             "shepherd_radius": frozen(radius[n:].copy()),
             "shepherd_max_speed": self._speed,
-            "obstacles": scenario.obstacles,
+            "obstacles": obstacles,
+            "surroundings": compile_shapes([(shape, -1, OBSTACLES) for shape, _ in static]),
             "control_dt": scenario.control_dt,
         }
         self._mass = np.array([body.mass for body, _, _ in bodies])

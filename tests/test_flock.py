@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from shepherd_phys.avoidance import NO_PUSH
 from shepherd_phys.flock import FLOCKS, FlockModel, Strombom, desired
 from shepherd_phys.settings import SettingsError
 from shepherd_phys.state import WorldState
@@ -93,7 +94,7 @@ def both(model, state, draws):
         desired(
             state.sheep_pos, state.sheep_heading, state.sheep_max_speed, state.shepherd_pos, draws, model.inertia,
             model.attraction, model.repulsion, model.flight, model.noise, model.detection_radius,
-            model.sheep_distance, model.n_neighbours, model.graze_probability, use_grid,
+            model.sheep_distance, model.n_neighbours, model.graze_probability, use_grid, NO_PUSH,
         )
         for use_grid in (False, True)
     ]  # fmt: skip

@@ -11,15 +11,17 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("shepherd_phys", "envs", "controllers", "scripts")
 
-# A module imports from the lines above its own and from its own. Obstacles stand above the state because
+# A module imports from the lines above its own and from its own. Obstacles and geometry stand above the state because
 # a state carries those of its world.
 ORDER = (
     ("files",),
     ("settings", "cells", "neighbours", "workers", "_frames", "_motion", "_shapes", "_raycast"),
     ("_engine",),
     ("bodies", "obstacles"),
+    ("geometry",),
     ("state",),
-    ("geometry", "placement"),
+    ("placement", "avoidance"),
+    ("layouts",),
     ("flock", "lidar"),
     ("scenario",),
     ("world",),

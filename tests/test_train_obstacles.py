@@ -1,0 +1,65 @@
+"""``train --scenario``, ``--obstacles`` and ``--density``: what they make of a preset, and their mistakes."""
+
+from pathlib import Path
+
+import pytest
+
+from shepherd_phys.layouts import Fenced, Scattered
+from shepherd_phys.learning.folder import PRESET
+from shepherd_phys.learning.preset import Preset, load_preset
+from shepherd_phys.scripts.command import parsed
+from shepherd_phys.scripts.train import Train, asked, main, prepare
+
+
+def prepared(words):
+    return prepare(*parsed(Train, "train", words.split()))
+
+
+@pytest.mark.parametrize(
+    ("words", "layout", "folder"),
+    [
+        ("--obstacles 12", Scattered(count=12), "runs/fast-wild-1000000-obstacles12"),
+        ("--density 0.01", Scattered(density=0.01), "runs/fast-wild-1000000-density0.01"),
+        ("--scenario fence", Fenced(), "runs/fast-wild-1000000-fence"),
+        (
+            "--scenario scattered --density 0.02",
+            Scattered(density=0.02),
+            "runs/fast-wild-1000000-scattered-density0.02",
+        ),
+    ],
+)
+def test_a_run_gets_its_obstacles_and_a_folder_of_its_own(words, layout, folder, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    made, preset = prepared(words)
+    assert made == Path(folder)
+    assert preset.scenario.layout == layout
+    assert Preset.from_toml(made / PRESET) == preset
+    assert prepared(f"--resume --out {made}")[1] == preset
+
+
+def test_a_scenario_says_where_its_flocks_are():
+    preset = asked(load_preset("collie"), *parsed(Train, "train", ["--scenario", "fence"]))
+    assert preset.flock_distance is None
+    assert preset.draw().base.flock_distance == (14.0, 20.0)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--obstacles 3 --density 0.1", "--obstacles and --density: both say how many obstacles there are"),
+        ("--scenario fence --obstacles 3", "--obstacles, --density: the scenario has a layout of its own, Fenced"),
+        ("--obstacles -1", "obstacles: -1 is impossible; it must be at least 0"),
+        ("--obstacles many", "--obstacles takes a whole number"),
+        ("--density 0.9", "Scattered.density: Input should be less than or equal to 0.5 (given: 0.9)"),
+        ("--density 0.48", "Scattered.density: 0.48 is impossible:"),
+        ("--density nan", "Scattered.density"),
+        ("--scenario desert", "scenario: 'desert' is neither a .toml file nor one of paper"),
+    ],
+)
+def test_mistakes_are_one_line_before_anything_is_made(words, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(words.split()) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert message in said
+    assert list(tmp_path.iterdir()) == []
