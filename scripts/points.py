@@ -78,7 +78,7 @@ class Point:
         """
         scenario = self.scenario
         controller = find_controller(self.controller)
-        things = [controller, scenario.sheep, scenario.flock, *scenario.shepherds, *scenario.obstacles]
+        things = [controller, *scenario.sheep_kinds, scenario.flock, *scenario.shepherds, *scenario.obstacles]
         try:
             return settings_hash(
                 {

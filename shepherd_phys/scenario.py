@@ -56,6 +56,15 @@ def _listed(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
+def _sheep_kinds(value: Any) -> Any:
+    """One body, or several."""
+    if isinstance(value, list | tuple):
+        if not value:
+            raise ValueError("give a body, or several that the sheep have in turn")
+        return tuple(value)
+    return value
+
+
 @settings
 class Scenario(Settings):
     """What a world holds, how it is placed at reset, and its two clocks.
@@ -83,8 +92,8 @@ class Scenario(Settings):
     """Centre g of the goal [m]; drawn uniformly from the box where None."""
     shepherds: Annotated[Any, BeforeValidator(_team)] = (Disc(), Disc(), Disc())
     """A tuple with one body a shepherd; given a number, that many default discs."""
-    sheep: Any = SHEEP
-    """The sheep's body."""
+    sheep: Annotated[Any, BeforeValidator(_sheep_kinds)] = SHEEP
+    """The sheep's body; a tuple: several, which the sheep have in turn, the first sheep the first one."""
     flock: Any = Strombom()
     """How sheep move: a flock model."""
     obstacles: tuple[Any, ...] = ()
@@ -124,6 +133,17 @@ class Scenario(Settings):
         return len(self.shepherds)
 
     @property
+    def sheep_kinds(self) -> tuple[Any, ...]:
+        """The bodies that the sheep have in turn."""
+        return self.sheep if isinstance(self.sheep, tuple) else (self.sheep,)
+
+    @property
+    def sheep_bodies(self) -> tuple[Any, ...]:
+        """(N,) each sheep's body."""
+        kinds = self.sheep_kinds
+        return (kinds * (self.n_sheep // len(kinds) + 1))[: self.n_sheep]
+
+    @property
     def n_substeps(self) -> int:
         """Engine steps in a control step."""
         return self.substeps or (OBSTACLE_SUBSTEPS if self.obstacles else OPEN_SUBSTEPS)
@@ -137,7 +157,7 @@ class Scenario(Settings):
         """Plain data from which `from_dict` makes an equal scenario."""
         table = Settings.to_dict(self)
         table["shepherds"] = [tagged(body) for body in self.shepherds]
-        table["sheep"] = tagged(self.sheep)
+        table["sheep"] = [tagged(body) for body in self.sheep] if isinstance(self.sheep, tuple) else tagged(self.sheep)
         table["flock"] = tagged(self.flock)
         table["obstacles"] = [tagged(obstacle) for obstacle in self.obstacles]
         return table
@@ -159,7 +179,11 @@ class Scenario(Settings):
             values["shepherds"] = tuple(
                 untagged(body, BODIES | own, f"Scenario.shepherds[{i}]") for i, body in enumerate(values["shepherds"])
             )
-        if "sheep" in values:
+        if isinstance(values.get("sheep"), list):
+            values["sheep"] = tuple(
+                untagged(body, BODIES | own, f"Scenario.sheep[{i}]") for i, body in enumerate(values["sheep"])
+            )
+        elif "sheep" in values:
             values["sheep"] = untagged(values["sheep"], BODIES | own, "Scenario.sheep")
         if "flock" in values:
             values["flock"] = untagged(values["flock"], FLOCKS | own, "Scenario.flock")
