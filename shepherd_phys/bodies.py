@@ -120,9 +120,9 @@ class Unicycle(Settings):
     """A disc that moves along its nose alone, and whose speed and spin change only so fast.
 
     With e the angle from the nose to the wanted velocity v*, its speed along the nose goes towards |v*| max(0, cos e)
-    and its spin towards sign(e) min(k |e|, omega_max, sqrt(2 alpha |e|)), by no more than a dt and alpha dt. The root is
-    the spin from which it can still stop at the wanted heading. Kinematics: LaValle 2006, Planning Algorithms, section
-    13.1.2.3. Sideways it has no way to go, and what pushes it there is lost at once.
+    and its spin towards sign(e) min(k |e|, omega_max, sqrt(2 alpha |e|)), by no more than a dt and alpha dt. The root
+    is the spin from which it can still stop at the wanted heading. Kinematics: LaValle 2006, Planning Algorithms,
+    section 13.1.2.3. Sideways it has no way to go, and what pushes it there is lost at once.
     """
 
     radius: float = Field(default=0.25, gt=0)
@@ -206,8 +206,8 @@ class PolygonRobot(Settings):
 class Flyer(Settings):
     """A flying shepherd: sheep fear it and lidars see it, but it collides with nothing.
 
-    Its velocity goes towards what is wanted by no more than a dt. It does not see what it is above; one that walks below
-    it reads 0 on every beam of the shepherds' channel, as inside any solid.
+    Its velocity goes towards what is wanted by no more than a dt. It does not see what it is above; one that walks
+    below it reads 0 on every beam of the shepherds' channel, as inside any solid.
     """
 
     flies: ClassVar[bool] = True
