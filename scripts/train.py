@@ -7,7 +7,7 @@ import importlib.util
 import math
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -19,8 +19,10 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from shepherd_phys.learning.folder import BEST, CURVE, POLICY, PRESET, VALIDATION, agree, begin
 from shepherd_phys.learning.preset import Preset, load_preset
 from shepherd_phys.settings import SettingsError
+from shepherd_phys.world import World
 
 from .command import LOG_SECONDS, at_least, clock, cpu_count, fail, flag, parsed
+from .own import find_kinds, of_kinds, take_step
 
 PROG = "shepherd-phys train"
 LIBRARIES = ("torch", "stable_baselines3", "tensorboard")
@@ -45,12 +47,16 @@ class Train:
     """Shepherd-steps (control steps times shepherds) to train for."""
     init: Annotated[str | None, flag("NAME|FILE", "the preset's")] = None
     """Policy to start from: a shipped one's name or a .json file."""
+    body: Annotated[str | None, flag("NAME|module:Name", "the preset's")] = None
+    """Body of every shepherd; those that the preset describes as such keep their parameters."""
+    flock: Annotated[str | None, flag("NAME|module:Name", "the preset's")] = None
+    """Flock model; if the preset describes such a one, with its parameters."""
     workers: Annotated[int, flag("W")] = cpu_count()
     """Processes for the worlds; the results do not depend on it."""
     out: Annotated[Path | None, flag("DIR", "runs/PRESET-REWARD-SEED")] = None
     """Folder of the run."""
     resume: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Go on with the run in --out."""
+    """Go on with the run in --out; classes of your own (--body, --flock) are given again."""
 
 
 FROM_PRESET = ("reward", "seed", "budget", "init")
@@ -63,7 +69,8 @@ def main(argv: Sequence[str]) -> int:
         options, flags = parsed(Train, PROG, argv)
         at_least(vars(options), {"seed": 0, "budget": 1, "workers": 1})
         check_libraries()
-        folder, preset = prepare(options, flags)
+        kinds = find_kinds(options.body, options.flock)
+        folder, preset = prepare(options, flags, kinds)
     except SettingsError as error:
         return fail(PROG, error, 2)
     # imported only now: torch takes seconds to load, which no mistake in the flags should cost
@@ -80,7 +87,7 @@ def main(argv: Sequence[str]) -> int:
     )
     with progress_bar() as report:
         try:
-            best = train(folder, options.workers, report)
+            best = train(folder, options.workers, report, classes=kinds.values())
         except SettingsError as error:
             return fail(PROG, error, 2)
         except (CheckpointError, TrainingError, ValidationError, WorkerError, WorkersError, OSError) as error:
@@ -95,8 +102,13 @@ def main(argv: Sequence[str]) -> int:
     return 0
 
 
-def prepare(options: Train, given: set[str]) -> tuple[Path, Preset]:
+def prepare(options: Train, given: set[str], kinds: Mapping[str, type[Any]]) -> tuple[Path, Preset]:
     """The folder of the run and its preset; a new run's folder is made.
+
+    Args:
+        options: the command line.
+        given: which of them were.
+        kinds: classes of the shepherds' bodies and of the flock model, see `shepherd_phys.scripts.points.find_kinds`.
 
     Raises:
         SettingsError: the folder holds another run, or none to resume; or the preset is impossible.
@@ -107,21 +119,35 @@ def prepare(options: Train, given: set[str]) -> tuple[Path, Preset]:
             raise SettingsError("--resume needs --out, the folder of the run")
         if not (options.out / PRESET).is_file():
             raise SettingsError(f"{options.out}: holds no run to resume (no {PRESET})")
-        preset = Preset.from_toml(options.out / PRESET)
-        wanted = load_preset(options.preset) if "preset" in given else preset
-        changed = wanted.but(**{"budget": preset.budget, **changes})
+        preset = Preset.from_toml(options.out / PRESET, kinds.values())
+        wanted = load_preset(options.preset, kinds.values()) if "preset" in given else preset
+        changed = dressed(wanted.but(**{"budget": preset.budget, **changes}), kinds)
         try:
-            agree(options.out, changed)
+            agree(options.out, changed, kinds.values())
         except SettingsError as error:
             raise SettingsError(f"{error}; --resume needs none but --out") from None
+        World(changed.scenario)  # finds out what was not handed over
         if changed != preset:
             changed.to_toml(options.out / PRESET)
         return options.out, changed
-    preset = load_preset(options.preset).but(**changes)
+    preset = dressed(load_preset(options.preset, kinds.values()).but(**changes), kinds)
     folder = options.out or Path("runs") / f"{Path(options.preset).stem}-{preset.reward}-{preset.seed}"
     preset.start()  # before a folder is made that the next attempt would find
+    if kinds:
+        world = World(preset.scenario)
+        world.reset(preset.validation.seed)
+        take_step(world)
     begin(folder, preset)
     return folder, preset
+
+
+def dressed(preset: Preset, kinds: Mapping[str, type[Any]]) -> Preset:
+    """The preset with bodies and flock model of these classes.
+
+    Raises:
+        SettingsError: one of them lacks something.
+    """
+    return preset.but(scenario=of_kinds(preset.scenario, kinds)[0]) if kinds else preset
 
 
 @contextlib.contextmanager

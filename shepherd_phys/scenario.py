@@ -12,6 +12,7 @@ from pydantic import BeforeValidator, Field
 
 from shepherd_phys.bodies import BODIES, SHEEP, Body, Disc
 from shepherd_phys.flock import FLOCKS, FlockModel, Strombom
+from shepherd_phys.imperfections import Imperfections
 from shepherd_phys.obstacles import OBSTACLES, Obstacle
 from shepherd_phys.settings import (
     Settings,
@@ -98,6 +99,8 @@ class Scenario(Settings):
     """How sheep move: a flock model."""
     obstacles: tuple[Any, ...] = ()
     """Solid, static things."""
+    imperfections: Imperfections | None = None
+    """What goes wrong with the shepherds' sensors and drives; none given: nothing."""
     n_steps: int = Field(default=1000, ge=1)
     """T: control steps of an episode; the nominal length in every formula."""
     control_dt: float = Field(default=0.2, gt=0)
@@ -187,6 +190,8 @@ class Scenario(Settings):
             values["sheep"] = untagged(values["sheep"], BODIES | own, "Scenario.sheep")
         if "flock" in values:
             values["flock"] = untagged(values["flock"], FLOCKS | own, "Scenario.flock")
+        if isinstance(values.get("imperfections"), Mapping):
+            values["imperfections"] = Imperfections(**values["imperfections"])
         if "obstacles" in values:
             if not isinstance(values["obstacles"], list):
                 raise SettingsError(f"Scenario.obstacles: must be a list of tables (given: {values['obstacles']!r})")

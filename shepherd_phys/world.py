@@ -29,6 +29,7 @@ from shepherd_phys.geometry import (
     Geometry,
     compile_shapes,
 )
+from shepherd_phys.imperfections import disturbed
 from shepherd_phys.lidar import Lidar, Scan, Sensor
 from shepherd_phys.obstacles import solid
 from shepherd_phys.placement import PlacementError, flock_of, place, relax
@@ -45,6 +46,9 @@ SHEEP_SETS = {
 
 PLACE_TRIES = 200
 """Draws of a placement among obstacles after which it is given up."""
+
+IMPERFECTIONS_STREAM = 1_000
+"""Spawn key of the streams of imperfect sensing and acting: far from those that an episode's seed spawns."""
 
 HASH_FROM = 1_000
 """Bodies from which the engine finds contacts by a spatial hash and not by its tree: a quarter faster among 10,000. Not
@@ -96,6 +100,7 @@ class World:
         state: the latest `WorldState`; `reset` makes the first.
         space: the pymunk Space of this episode, to look at.
         user_rng: generator for controllers and users, seeded by `reset` apart from the world's own.
+        sensing_rng: the same for what goes wrong with the shepherds' sensors (`shepherd_phys.imperfections.Sight`).
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -233,6 +238,8 @@ class World:
         placement, noise, users = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(3))
         self._noise = noise
         self.user_rng = users
+        wrong = np.random.SeedSequence(seed, spawn_key=(IMPERFECTIONS_STREAM,)).spawn(2)
+        self.sensing_rng, self._acting_rng = (np.random.default_rng(s) for s in wrong)
         return placement
 
     def _new_bodies(self) -> tuple[list[tuple[pymunk.Body, list[pymunk.Shape], float]], list[tuple[pymunk.Shape, int]]]:
@@ -347,6 +354,9 @@ class World:
         if action.shape != (self._p, 2):
             raise ValueError(f"action: needs shape ({self._p}, 2), one row a shepherd (given: {action.shape})")
         command = self._command
+        wrong = scenario.imperfections
+        if wrong is not None and wrong.action_noise > 0 and np.isfinite(action).all():
+            action = disturbed(action, wrong.action_noise, self._acting_rng)
         # before the flock draws its random numbers: a refused action must change nothing
         if not _motion.command_shepherds(action, self._speed, command):
             raise NonFiniteError("action: every number must be finite")

@@ -21,6 +21,7 @@ ORDER = (
     ("state",),
     ("geometry", "placement"),
     ("flock", "lidar"),
+    ("imperfections",),
     ("scenario",),
     ("world",),
     ("canvas", "cluster", "ledger"),

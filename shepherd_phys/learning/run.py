@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -62,6 +62,7 @@ def train(
     n_workers: int = 1,
     report: Callable[[Progress], None] = lambda _: None,
     seconds: float = math.inf,
+    classes: Iterable[Any] = (),
 ) -> Chosen | None:
     """Train in a folder, from its last checkpoint if it has one, until the budget is spent.
 
@@ -75,6 +76,7 @@ def train(
             on it.
         report: called after each rollout and each validation.
         seconds: of training, as in the curve: the run ends with the first rollout that reaches them, too.
+        classes: a user's own (of bodies, flock models, obstacles) that the preset's scenario names.
 
     Returns:
         the best policy.
@@ -85,7 +87,7 @@ def train(
         CheckpointError: a checkpoint cannot be written, or none of those there can be read.
     """
     with alone(folder):
-        preset = Preset.from_toml(folder / PRESET)
+        preset = Preset.from_toml(folder / PRESET, classes)
         saved = checkpoints.load_latest(folder / CHECKPOINTS)
         logger = configure(str(folder / TENSORBOARD), ["tensorboard"])
         learner = Learner(preset, n_workers if n_workers > 1 else 0, logger, fresh=saved is None)
