@@ -49,8 +49,8 @@ class Evaluate:
     """Numbers of shepherds."""
     sheep: Annotated[int | None, flag("N", "the scenario's")] = None
     """Number of sheep."""
-    scenario: Annotated[str, flag("NAME|FILE")] = "paper"
-    """A preset's name or a TOML file."""
+    scenario: Annotated[str, flag("NAME|FILE|module:Name")] = "paper"
+    """A preset's name, a TOML file, or a Scenario of your own."""
     body: Annotated[str | None, flag("NAME|module:Name", "the scenario's")] = None
     """Body of every shepherd; those that the file describes as such keep their parameters."""
     flock: Annotated[str | None, flag("NAME|module:Name", "the scenario's")] = None

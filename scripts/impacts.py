@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from shepherd_phys.bodies import SHEEP, Disc
+from shepherd_phys.bodies import SHEEP, Body, Disc, built
 from shepherd_phys.obstacles import MIN_THICKNESS, Pillar, Wall
 from shepherd_phys.scenario import Scenario
 from shepherd_phys.state import Floats, WorldState
 from shepherd_phys.world import World
 
+SHEPHERD = Disc()
 PILLAR_RADIUS = 0.2
 """[m]"""
 LANE = 40.0
@@ -36,7 +37,7 @@ class _Charge:
         return self.wanted
 
 
-def impacts(count: int, seed: int, **engine: int) -> dict[str, Any]:
+def impacts(count: int, seed: int, shepherd: Body = SHEPHERD, sheep: Body = SHEEP, **engine: int) -> dict[str, Any]:
     """Run ``count`` impacts at top speed and random angles, spread evenly over kinds, in worlds of many lanes.
 
     A body has tunnelled if at the end of any control step its centre lies inside the obstacle or on its far side.
@@ -44,6 +45,8 @@ def impacts(count: int, seed: int, **engine: int) -> dict[str, Any]:
     Args:
         count: number of impacts, rounded up to whole worlds.
         seed: of the angles and places.
+        shepherd: every shepherd's body. Overlaps and touches are those of the disc that holds it.
+        sheep: every sheep's body.
         engine: scenario fields to change (``substeps``, ``iterations``).
 
     Returns:
@@ -52,8 +55,8 @@ def impacts(count: int, seed: int, **engine: int) -> dict[str, Any]:
     """
     lanes = [(pair, kind) for pair in PAIRS for kind in ("wall", "pillar")] * 10
     rng = np.random.default_rng(seed)
-    radius = {"sheep": SHEEP.radius, "shepherd": Disc().radius}
-    speed = {"sheep": SHEEP.max_speed, "shepherd": Disc().max_speed}
+    radius = {"sheep": built(sheep, "sheep")[2], "shepherd": built(shepherd, "shepherd")[2]}
+    speed = {"sheep": sheep.max_speed, "shepherd": shepherd.max_speed}
     centers = np.array([[0.0, LANE * k] for k in range(len(lanes))])
     obstacles = tuple(
         Wall((x, y - HALF_WALL), (x, y + HALF_WALL), MIN_THICKNESS) if kind == "wall" else Pillar((x, y), PILLAR_RADIUS)
@@ -64,7 +67,12 @@ def impacts(count: int, seed: int, **engine: int) -> dict[str, Any]:
     n_sheep = sum(who == "sheep" for _, _, who in bodies)
     charge = _Charge(np.zeros((n_sheep, 2)))
     scenario = Scenario(
-        n_sheep=n_sheep, n_flocks=1, shepherds=len(order) - n_sheep, flock=charge, obstacles=obstacles
+        n_sheep=n_sheep,
+        n_flocks=1,
+        shepherds=(shepherd,) * (len(order) - n_sheep),
+        sheep=sheep,
+        flock=charge,
+        obstacles=obstacles,
     ).but(**engine)
     world = World(scenario)
     # the template only lends its shape; every position is set below
@@ -104,6 +112,7 @@ def impacts(count: int, seed: int, **engine: int) -> dict[str, Any]:
                 sheep_vel=velocity[:n_sheep],
                 shepherd_pos=pos[n_sheep:],
                 shepherd_vel=velocity[n_sheep:],
+                shepherd_angle=np.arctan2(wanted[n_sheep:, 1], wanted[n_sheep:, 0]),
             ),
             world_seed,
         )

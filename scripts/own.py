@@ -7,7 +7,7 @@ import importlib
 import inspect
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from shepherd_phys.bodies import BODIES, Body, Disc
 from shepherd_phys.flock import FLOCKS, FlockModel
-from shepherd_phys.scenario import Scenario
+from shepherd_phys.scenario import Scenario, load_scenario
 from shepherd_phys.settings import SettingsError, kind_of
 from shepherd_phys.workers import explain
 from shepherd_phys.world import World
@@ -29,6 +29,20 @@ def find_kinds(body: str | None, flock: str | None) -> dict[str, type[Any]]:
     """
     named = {"body": (body, BODIES), "flock": (flock, FLOCKS)}
     return {where: find_class(name, known, where) for where, (name, known) in named.items() if name is not None}
+
+
+def find_scenario(name: str, classes: Iterable[type[Any]]) -> Scenario:
+    """A preset by its name, from a TOML file, or ``module:Name`` of a user's own.
+
+    Raises:
+        SettingsError: there is none.
+    """
+    if ":" not in name or name.endswith(".toml"):
+        return load_scenario(name, classes)
+    own = imported(name, "scenario")
+    if not isinstance(own, Scenario):
+        raise SettingsError(f"scenario: {name}: needs a Scenario (it is a {type(own).__name__})")
+    return own
 
 
 def of_kinds(base: Scenario, kinds: Mapping[str, type[Any]]) -> tuple[Scenario, Any]:

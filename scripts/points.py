@@ -27,12 +27,12 @@ from shepherd_phys.controllers.evaluation import (
 )
 from shepherd_phys.controllers.summary import difference_columns, paired_differences, summarise, summary_columns
 from shepherd_phys.envs.shepherding import ShepherdingEnv
-from shepherd_phys.scenario import Scenario, load_scenario
+from shepherd_phys.scenario import Scenario
 from shepherd_phys.settings import SettingsError, kind_of
 from shepherd_phys.workers import explain
 from shepherd_phys.world import World
 
-from .own import find_kinds, imported, of_kinds, source_hash, take_step
+from .own import find_kinds, find_scenario, imported, of_kinds, source_hash, take_step
 
 KINDS: dict[str, type] = {
     **dict.fromkeys(COLUMNS, float),
@@ -108,7 +108,7 @@ def points(
 
     Args:
         controllers: names, policy files, or ``module:Name`` of a user's own.
-        scenario: a preset's name or a TOML file.
+        scenario: a preset's name, a TOML file, or ``module:Name`` of a user's own.
         flocks: numbers of flocks.
         cohesion: n, neighbours in the flock model's cohesion.
         shepherds: numbers of shepherds.
@@ -124,7 +124,7 @@ def points(
     for name in controllers:
         find_controller(name)
     kinds = find_kinds(body, flock)
-    base = load_scenario(scenario, kinds.values())
+    base = find_scenario(scenario, kinds.values())
     if sheep is not None:
         # with the number of flocks, which is checked against it
         base = base.but(n_sheep=sheep, n_flocks=min(base.n_flocks, sheep) if flocks else base.n_flocks)
