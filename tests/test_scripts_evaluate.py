@@ -538,7 +538,10 @@ MISTAKES = [
     ("--scenario nowhere.toml", "nowhere.toml: cannot be read (No such file or directory)"),
     ("--scenario bad.toml", "bad.toml: is not a TOML file"),
     ("--scenario odd.toml", "Scenario.n_shep: there is no such field"),
-    ("--body nobody", "body: 'nobody' is unknown; there are DifferentialDrive, Disc, Flyer, PolygonRobot, Unicycle, or"),
+    (
+        "--body nobody",
+        "body: 'nobody' is unknown; there are DifferentialDrive, Disc, Flyer, PolygonRobot, Unicycle, or",
+    ),
     ("--body mine:Stone", "body: mine:Stone: lacks build, follow"),
     ("--body mine:Needy", "body: mine:Needy: cannot be made without arguments"),
     ("--body mine:number", "body: mine:number: needs a class (it is a int)"),
