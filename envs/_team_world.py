@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shepherd_phys.lidar import Lidar, Scan, Stack, encode, turn
+from shepherd_phys.imperfections import Sight
+from shepherd_phys.lidar import Lidar, Scan, Stack, turn
 from shepherd_phys.scenario import Scenario
 from shepherd_phys.settings import SettingsError
 from shepherd_phys.state import WorldState
@@ -139,6 +140,7 @@ class TeamWorld:
         self._held.reset()
         self._held(self.state, measures(self.state)["is_success"])
         self._stack.reset()
+        self._sight = Sight(self._plan.lidar, self.scenario.imperfections, self.world.sensing_rng)
         self._look()
         self._observe()
 
@@ -197,7 +199,7 @@ class TeamWorld:
     def _look(self) -> Scan:
         """Scan, and take the frame into the stack."""
         scan = self.world.scan(self._scan_lidar, self._sets)
-        self._stack.push(encode(scan, self._plan.lidar))
+        self._stack.push(self._sight.frame(scan))
         return scan
 
     def _observe(self) -> None:

@@ -11,7 +11,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from shepherd_phys.lidar import Lidar, Scan, Stack, encode
+from shepherd_phys.imperfections import Sight
+from shepherd_phys.lidar import Lidar, Scan, Stack
 from shepherd_phys.scenario import Scenario, load_scenario
 from shepherd_phys.settings import SettingsError
 from shepherd_phys.state import Floats, WorldState
@@ -51,6 +52,9 @@ class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     Beam k points at 2 pi k / 512 from the x axis. A value is 1 - distance / range, 0 where nothing is seen. Fewer
     sectors, the goal frame and the paper's 1536 x 1 x 3 arrangement are settings of `shepherd_phys.lidar.Lidar`. In the
     goal frame observations are rolled by ``beam_offset`` (P,) beams; actions stay in world axes.
+
+    With the scenario's ``imperfections`` beams are lost, ranges noisy, scans late and actions inexact. Rewards and info
+    are of the true state and scan all the same.
 
     ## Rewards
 
@@ -171,8 +175,9 @@ class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._trails.clear()
         self._start = state.sheep_pos
         self._scan = self._look()
-        if self._stack is not None:
+        if self._stack is not None and self.lidar is not None:
             self._stack.reset()
+            self._sight = Sight(self.lidar, self.scenario.imperfections, self.world.sensing_rng)
         zeros = {f"reward/{name}": 0.0 for name in self._scheme}
         for keys in self._share_keys.values():
             zeros.update(dict.fromkeys(keys, 0.0))
@@ -226,6 +231,6 @@ class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     def _observe(self) -> NDArray[np.float32]:
         if self.lidar is None or self._stack is None or self._scan is None:
             return np.zeros((self.scenario.n_shepherds, 0), dtype=np.float32)
-        self._stack.push(encode(self._scan, self.lidar))
+        self._stack.push(self._sight.frame(self._scan))
         observation, self.beam_offset = self._stack.observe(self.beam_offset)
         return observation

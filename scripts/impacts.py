@@ -53,7 +53,7 @@ class _Charge:
         return self.wanted
 
 
-def impacts(count: int, seed: int, shepherd: Body | None = None, **engine: int) -> dict[str, Any]:
+def impacts(count: int, seed: int, shepherd: Body | None = None, sheep: Body = SHEEP, **engine: int) -> dict[str, Any]:
     """Run ``count`` impacts at top speed and random angles, spread evenly over kinds, in worlds of many lanes.
 
     A body has tunnelled if at the end of any control step its centre lies inside the obstacle or on its far side.
@@ -61,7 +61,9 @@ def impacts(count: int, seed: int, shepherd: Body | None = None, **engine: int) 
     Args:
         count: number of impacts, rounded up to whole worlds.
         seed: of the angles and places.
-        shepherd: body of the shepherds; none given: the default disc. It starts with its nose towards the obstacle.
+        shepherd: every shepherd's body; none given: the default disc. It starts with its nose towards the obstacle.
+            Overlaps and touches are those of the disc that holds it.
+        sheep: every sheep's body.
         engine: scenario fields to change (``substeps``, ``iterations``).
 
     Returns:
@@ -70,7 +72,7 @@ def impacts(count: int, seed: int, shepherd: Body | None = None, **engine: int) 
     """
     lanes = [(pair, kind) for pair in PAIRS for kind in KINDS] * REPEATS
     rng = np.random.default_rng(seed)
-    bodies = {"sheep": SHEEP, "shepherd": shepherd or Disc()}
+    bodies: dict[str, Body] = {"sheep": sheep, "shepherd": shepherd or Disc()}
     reach = {who: built(body, who)[2] for who, body in bodies.items()}
     roles = [(lane, role, who) for lane, (pair, _) in enumerate(lanes) for role, who in enumerate(pair) if who]
     order = [r for r in roles if r[2] == "sheep"] + [r for r in roles if r[2] == "shepherd"]
@@ -80,6 +82,7 @@ def impacts(count: int, seed: int, shepherd: Body | None = None, **engine: int) 
         n_sheep=n_sheep,
         n_flocks=1,
         shepherds=(bodies["shepherd"],) * (len(order) - n_sheep),
+        sheep=sheep,
         flock=charge,
         obstacles=tuple(KINDS[kind](LANE * lane) for lane, (_, kind) in enumerate(lanes)),
     ).but(**engine)

@@ -6,12 +6,8 @@ What `evaluate` and `reproduce` share. It is the place where envs and controller
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import importlib
 import inspect
 import itertools
-import os
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -19,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 from shepherd_phys import __version__
-from shepherd_phys.bodies import BODIES, Body, Disc
 from shepherd_phys.campaign import Outcome, Task, remove, settings_hash, write_csv, write_parquet
 from shepherd_phys.controllers import CONTROLLERS, Controller, Policy, load_policy
 from shepherd_phys.controllers.evaluation import (
@@ -32,10 +27,12 @@ from shepherd_phys.controllers.evaluation import (
 )
 from shepherd_phys.controllers.summary import difference_columns, paired_differences, summarise, summary_columns
 from shepherd_phys.envs.shepherding import ShepherdingEnv
-from shepherd_phys.flock import FLOCKS, FlockModel
-from shepherd_phys.scenario import Scenario, load_scenario
+from shepherd_phys.scenario import Scenario
 from shepherd_phys.settings import SettingsError, kind_of
 from shepherd_phys.workers import explain
+from shepherd_phys.world import World
+
+from .own import find_kinds, find_scenario, imported, of_kinds, source_hash, take_step
 
 KINDS: dict[str, type] = {
     **dict.fromkeys(COLUMNS, float),
@@ -78,7 +75,7 @@ class Point:
         """
         scenario = self.scenario
         controller = find_controller(self.controller)
-        things = [controller, scenario.sheep, scenario.flock, *scenario.shepherds, *scenario.obstacles]
+        things = [controller, *scenario.sheep_kinds, scenario.flock, *scenario.shepherds, *scenario.obstacles]
         things += [scenario.layout] if scenario.layout is not None else []
         try:
             return settings_hash(
@@ -127,19 +124,12 @@ def points(
     """
     for name in controllers:
         find_controller(name)
-    body_class = None if body is None else find_class(body, BODIES, "body")
-    flock_class = None if flock is None else find_class(flock, FLOCKS, "flock")
-    classes = [cls for cls in (body_class, flock_class) if cls is not None]
-    base = find_scenario(scenario, classes)
+    kinds = find_kinds(body, flock)
+    base = find_scenario(scenario, kinds.values())
     if sheep is not None:
         # with the number of flocks, which is checked against it
         base = base.but(n_sheep=sheep, n_flocks=min(base.n_flocks, sheep) if flocks else base.n_flocks)
-    if flock_class is not None and type(base.flock) is not flock_class:
-        base = base.but(flock=_made(flock_class, FlockModel, f"flock: {flock}"))
-    default: Any = Disc()
-    if body_class is not None and (not base.shepherds or any(type(own) is not body_class for own in base.shepherds)):
-        default = _made(body_class, Body, f"body: {body}")
-        base = base.but(shepherds=tuple(own if type(own) is body_class else default for own in base.shepherds))
+    base, default = of_kinds(base, kinds)
     shown = Path(scenario).name
     found = []
     lists = [dict.fromkeys(values) or [None] for values in (flocks, cohesion, shepherds)]  # nothing twice
@@ -169,19 +159,20 @@ def tasks(points: Iterable[Point], seeds: Sequence[int]) -> list[Task]:
 
 
 def place(point: Point, seeds: Sequence[int]) -> None:
-    """Place a point's world on one of the seeds.
+    """Place a point's world on one of the seeds, and make a step: bodies and flock models may be a user's own.
 
     Raises:
-        SettingsError: it cannot be placed on any.
+        SettingsError: it cannot be placed on any, or not make a step.
     """
-    env = ShepherdingEnv(point.scenario, rewards={}, lidar=None)
+    world = World(point.scenario)
     for i, seed in enumerate(seeds, start=1):
         try:
-            env.reset(seed=seed)
-            return
+            world.reset(seed)
+            break
         except SettingsError:
             if i == len(seeds):
                 raise
+    take_step(world)
 
 
 def episode(point: Point, seed: int) -> dict[str, Any]:
@@ -263,98 +254,6 @@ def find_controller(name: str) -> Controller:
             "or module:Name of your own"
         )
     return CONTROLLERS[name]()
-
-
-def find_scenario(name: str, classes: Iterable[Any] = ()) -> Scenario:
-    """A scenario by its name, from a TOML file, or ``module:Name`` of one or of a function that makes one.
-
-    Args:
-        name: of it.
-        classes: a user's own classes, for a file that names them.
-
-    Raises:
-        SettingsError: there is none of this name.
-    """
-    if ":" not in name or name.endswith(".toml"):
-        return load_scenario(name, classes)
-    own = imported(name, "scenario")
-    if inspect.isroutine(own):
-        try:
-            own = own()
-        except SettingsError:
-            raise
-        except Exception as error:
-            raise SettingsError(f"scenario: {name}: cannot be made: {explain(error)}") from None
-    if not isinstance(own, Scenario):
-        raise SettingsError(f"scenario: {name}: needs a Scenario (it is a {type(own).__name__})")
-    return own
-
-
-def find_class(name: str, known: dict[str, type[Any]], where: str) -> type[Any]:
-    """A class by its name among ``known`` or by ``module:Name``.
-
-    Raises:
-        SettingsError: there is none.
-    """
-    if ":" not in name:
-        if name not in known:
-            raise SettingsError(
-                f"{where}: {name!r} is unknown; there are {', '.join(sorted(known))}, or module:Name of your own"
-            )
-        return known[name]
-    own = imported(name, where)
-    if not inspect.isclass(own):
-        raise SettingsError(f"{where}: {name}: needs a class (it is a {type(own).__name__})")
-    return own
-
-
-def imported(name: str, where: str) -> Any:
-    """The object ``module:Name``, its module found from the current directory too.
-
-    Raises:
-        SettingsError: it cannot be imported, or the module lacks it.
-    """
-    module_name, _, attribute = name.partition(":")
-    if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())  # at the end: it must not hide an installed package, ours in a checkout included
-    try:
-        module = importlib.import_module(module_name)
-    except (Exception, SystemExit) as error:
-        raise SettingsError(f"{where}: {name}: module {module_name!r} cannot be imported: {explain(error)}") from None
-    if not hasattr(module, attribute):
-        raise SettingsError(f"{where}: {name}: module {module_name!r} has no {attribute!r}")
-    return getattr(module, attribute)
-
-
-def source_hash(thing: Any) -> str | None:
-    """SHA-256 of the file that holds the object's class: an edited class must not find the rows of the old one."""
-    try:
-        path = inspect.getsourcefile(thing if inspect.isclass(thing) or inspect.isroutine(thing) else type(thing))
-        return hashlib.sha256(Path(path or "").read_bytes()).hexdigest()
-    except (TypeError, OSError):
-        return None
-
-
-def _made(cls: type[Any], protocol: type[Any], where: str) -> Any:
-    """An object of the class.
-
-    Raises:
-        SettingsError: it cannot be made without arguments, or lacks something that ``protocol`` asks for.
-    """
-    try:
-        made = cls()
-    except TypeError as error:
-        raise SettingsError(
-            f"{where}: cannot be made without arguments ({error}); a scenario file can give them"
-        ) from None
-    except SettingsError:
-        raise
-    except Exception as error:
-        raise SettingsError(f"{where}: cannot be made: {explain(error)}") from None
-    lacking = [member for member in vars(protocol) if not member.startswith("_") and not hasattr(made, member)]
-    if lacking:
-        raise SettingsError(f"{where}: lacks {', '.join(lacking)}")
-    return made
 
 
 def _with_neighbours(flock: Any, n: int) -> Any:

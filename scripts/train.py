@@ -7,7 +7,7 @@ import importlib.util
 import math
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -19,11 +19,11 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from shepherd_phys.layouts import Scattered
 from shepherd_phys.learning.folder import BEST, CURVE, POLICY, PRESET, VALIDATION, agree, begin
 from shepherd_phys.learning.preset import Preset, load_preset
-from shepherd_phys.scenario import load_scenario
 from shepherd_phys.settings import SettingsError, kind_of
 from shepherd_phys.world import World
 
 from .command import LOG_SECONDS, at_least, clock, cpu_count, fail, flag, parsed
+from .own import find_kinds, find_scenario, of_kinds, take_step
 
 PROG = "shepherd-phys train"
 LIBRARIES = ("torch", "stable_baselines3", "tensorboard")
@@ -48,18 +48,22 @@ class Train:
     """Shepherd-steps (control steps times shepherds) to train for; a run ends with a whole checkpoint interval."""
     init: Annotated[str | None, flag("NAME|FILE", "the preset's")] = None
     """Policy to start from: a shipped one's name or a .json file."""
-    scenario: Annotated[str | None, flag("NAME|FILE", "the preset's")] = None
+    scenario: Annotated[str | None, flag("NAME|FILE|module:Name", "the preset's")] = None
     """Scenario; where its flocks are is its own, and not the preset's, then."""
     obstacles: Annotated[int | None, flag("COUNT", "the scenario's")] = None
     """Discs of radius 1 m, drawn anew for each episode: so many."""
     density: Annotated[float | None, flag("FRACTION", "the scenario's")] = None
     """The same, given as the part of the box's area that they cover."""
+    body: Annotated[str | None, flag("NAME|module:Name", "the preset's")] = None
+    """Body of every shepherd; those that the preset describes as such keep their parameters."""
+    flock: Annotated[str | None, flag("NAME|module:Name", "the preset's")] = None
+    """Flock model; if the preset describes such a one, with its parameters."""
     workers: Annotated[int, flag("W")] = cpu_count()
     """Processes for the worlds; the results do not depend on it."""
     out: Annotated[Path | None, flag("DIR", "runs/PRESET-REWARD-SEED..")] = None
     """Folder of the run."""
     resume: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Go on with the run in --out."""
+    """Go on with the run in --out; classes of your own (--body, --flock) are given again."""
 
 
 FROM_PRESET = ("reward", "seed", "budget", "init")
@@ -72,7 +76,8 @@ def main(argv: Sequence[str]) -> int:
         options, flags = parsed(Train, PROG, argv)
         at_least(vars(options), {"seed": 0, "budget": 1, "obstacles": 0, "workers": 1})
         check_libraries()
-        folder, preset = prepare(options, flags)
+        kinds = find_kinds(options.body, options.flock)
+        folder, preset = prepare(options, flags, kinds)
     except SettingsError as error:
         return fail(PROG, error, 2)
     # imported only now: torch takes seconds to load, which no mistake in the flags should cost
@@ -90,7 +95,7 @@ def main(argv: Sequence[str]) -> int:
     )
     with progress_bar() as report:
         try:
-            best = train(folder, options.workers, report, preset=preset)
+            best = train(folder, options.workers, report, preset=preset, classes=kinds.values())
         except SettingsError as error:
             return fail(PROG, error, 2)
         except (CheckpointError, TrainingError, ValidationError, WorkerError, WorkersError, OSError) as error:
@@ -105,8 +110,13 @@ def main(argv: Sequence[str]) -> int:
     return 0
 
 
-def prepare(options: Train, given: set[str]) -> tuple[Path, Preset]:
+def prepare(options: Train, given: set[str], kinds: Mapping[str, type[Any]]) -> tuple[Path, Preset]:
     """The folder of the run, and what its preset shall be; a new run's folder is made, another one left as it is.
+
+    Args:
+        options: the command line.
+        given: which of them were.
+        kinds: classes of the shepherds' bodies and of the flock model, see `shepherd_phys.scripts.points.find_kinds`.
 
     Raises:
         SettingsError: the folder holds another run, or none to resume; or the preset is impossible.
@@ -116,45 +126,48 @@ def prepare(options: Train, given: set[str]) -> tuple[Path, Preset]:
             raise SettingsError("--resume needs --out, the folder of the run")
         if not (options.out / PRESET).is_file():
             raise SettingsError(f"{options.out}: holds no run to resume (no {PRESET})")
-        preset = Preset.from_toml(options.out / PRESET)
-        wanted = load_preset(options.preset) if "preset" in given else preset
-        changed = asked(wanted.but(budget=preset.budget), options, given)
+        preset = Preset.from_toml(options.out / PRESET, kinds.values())
+        wanted = load_preset(options.preset, kinds.values()) if "preset" in given else preset
+        changed = asked(wanted.but(budget=preset.budget), options, given, kinds)
         try:
-            agree(options.out, changed)
+            agree(options.out, changed, kinds.values())
         except SettingsError as error:
             raise SettingsError(f"{error}; --resume needs none but --out") from None
+        World(changed.scenario)  # finds out what was not handed over
         return options.out, changed  # `train` writes it, once nobody else is at the run
-    preset = asked(load_preset(options.preset), options, given)
+    preset = asked(load_preset(options.preset, kinds.values()), options, given, kinds)
     words = [Path(options.preset).stem, preset.reward, str(preset.seed)]
     words += [Path(options.scenario).stem] if options.scenario is not None else []
     words += [f"{name}{getattr(options, name):g}" for name in ("obstacles", "density") if name in given]
     folder = options.out or Path("runs") / "-".join(words)
     # before a folder is made that the next attempt would find
     preset.start()
-    if preset.scenario.has_obstacles:
-        World(preset.scenario).reset(preset.seed)  # whether there is room for them
+    if preset.scenario.has_obstacles or kinds or options.scenario is not None:
+        world = World(preset.scenario)
+        world.reset(preset.validation.seed)  # whether there is room for obstacles
+        take_step(world)
     begin(folder, preset)
     return folder, preset
 
 
-def asked(preset: Preset, options: Train, given: set[str]) -> Preset:
+def asked(preset: Preset, options: Train, given: set[str], kinds: Mapping[str, type[Any]]) -> Preset:
     """The preset with what the flags change.
 
     Raises:
-        SettingsError: a flag's value is impossible, or two of them do not go together.
+        SettingsError: a flag's value is impossible, two of them do not go together, or a class lacks something.
     """
     preset = preset.but(**{name: getattr(options, name) for name in FROM_PRESET if name in given})
     if options.scenario is not None:
-        preset = preset.but(scenario=load_scenario(options.scenario), flock_distance=None)
-    if options.obstacles is None and options.density is None:
-        return preset
+        preset = preset.but(scenario=find_scenario(options.scenario, kinds.values()), flock_distance=None)
     if options.obstacles is not None and options.density is not None:
         raise SettingsError("--obstacles and --density: both say how many obstacles there are; leave one of them out")
-    layout = preset.scenario.layout or Scattered(count=0)
-    if not isinstance(layout, Scattered):
-        raise SettingsError(f"--obstacles, --density: the scenario has a layout of its own, {kind_of(layout)}")
-    layout = layout.but(count=options.obstacles, density=options.density)
-    return preset.but(scenario=preset.scenario.but(layout=layout))
+    if options.obstacles is not None or options.density is not None:
+        layout = preset.scenario.layout or Scattered(count=0)
+        if not isinstance(layout, Scattered):
+            raise SettingsError(f"--obstacles, --density: the scenario has a layout of its own, {kind_of(layout)}")
+        layout = layout.but(count=options.obstacles, density=options.density)
+        preset = preset.but(scenario=preset.scenario.but(layout=layout))
+    return preset.but(scenario=of_kinds(preset.scenario, kinds)[0]) if kinds else preset
 
 
 @contextlib.contextmanager

@@ -24,6 +24,7 @@ from shepherd_phys._shapes import (
 from shepherd_phys.obstacles import Obstacle, solid
 
 __all__ = [
+    "BEAM_CATEGORY",
     "DISC",
     "HIDDEN_CATEGORY",
     "OBSTACLES",
@@ -48,6 +49,8 @@ OBSTACLE_CATEGORY = 4
 """Filter categories that the world gives to shapes; each channel's beams see one of them."""
 HIDDEN_CATEGORY = 8
 """Category of sheep that a scan of a part of the sheep leaves out, during that scan only."""
+BEAM_CATEGORY = 16
+"""Category that queries have and no shape: flying bodies meet it alone, so beams see what nothing touches."""
 
 CLEARANCE = 1e-3
 """Gap that `Geometry.push_out` leaves [m]."""

@@ -13,6 +13,7 @@ from pydantic import BeforeValidator, Field
 from shepherd_phys.avoidance import Avoidance
 from shepherd_phys.bodies import BODIES, SHEEP, Body, Disc
 from shepherd_phys.flock import FLOCKS, FlockModel, Strombom
+from shepherd_phys.imperfections import Imperfections
 from shepherd_phys.layouts import LAYOUTS, Corridor, Fenced, Lattice, Layout, Scattered
 from shepherd_phys.lidar import CHANNELS, Channel
 from shepherd_phys.obstacles import OBSTACLES, Obstacle
@@ -62,6 +63,15 @@ def _listed(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
+def _sheep_kinds(value: Any) -> Any:
+    """One body, or several."""
+    if isinstance(value, list | tuple):
+        if not value:
+            raise ValueError("give a body, or several that the sheep have in turn")
+        return tuple(value)
+    return value
+
+
 @settings
 class Scenario(Settings):
     """What a world holds, how it is placed at reset, and its two clocks.
@@ -91,8 +101,8 @@ class Scenario(Settings):
     """Centre g of the goal [m]; drawn uniformly from the box where None."""
     shepherds: Annotated[Any, BeforeValidator(_team)] = (Disc(), Disc(), Disc())
     """A tuple with one body a shepherd; given a number, that many default discs."""
-    sheep: Any = SHEEP
-    """The sheep's body."""
+    sheep: Annotated[Any, BeforeValidator(_sheep_kinds)] = SHEEP
+    """The sheep's body; a tuple: several, which the sheep have in turn, the first sheep the first one."""
     flock: Any = Strombom()
     """How sheep move: a flock model."""
     obstacles: tuple[Any, ...] = ()
@@ -103,6 +113,8 @@ class Scenario(Settings):
     """Obstacles of a layout keep this far from the goal's border [m]."""
     body_keep_out: float = Field(default=BODY_KEEP_OUT, ge=0)
     """Where a layout draws, every body starts at least this far from any obstacle [m]."""
+    imperfections: Imperfections | None = None
+    """What goes wrong with the shepherds' sensors and drives; none given: nothing."""
     n_steps: int = Field(default=1000, ge=1)
     """T: control steps of an episode; the nominal length in every formula."""
     control_dt: float = Field(default=0.2, gt=0)
@@ -140,6 +152,17 @@ class Scenario(Settings):
         return len(self.shepherds)
 
     @property
+    def sheep_kinds(self) -> tuple[Any, ...]:
+        """The bodies that the sheep have in turn."""
+        return self.sheep if isinstance(self.sheep, tuple) else (self.sheep,)
+
+    @property
+    def sheep_bodies(self) -> tuple[Any, ...]:
+        """(N,) each sheep's body."""
+        kinds = self.sheep_kinds
+        return (kinds * (self.n_sheep // len(kinds) + 1))[: self.n_sheep]
+
+    @property
     def has_obstacles(self) -> bool:
         """Whether its worlds can have obstacles, whatever is drawn."""
         return bool(self.obstacles) or self.layout is not None
@@ -163,7 +186,7 @@ class Scenario(Settings):
         """Plain data from which `from_dict` makes an equal scenario."""
         table = Settings.to_dict(self)
         table["shepherds"] = [tagged(body) for body in self.shepherds]
-        table["sheep"] = tagged(self.sheep)
+        table["sheep"] = [tagged(body) for body in self.sheep] if isinstance(self.sheep, tuple) else tagged(self.sheep)
         table["flock"] = tagged(self.flock)
         table["obstacles"] = [tagged(obstacle) for obstacle in self.obstacles]
         if self.layout is not None:
@@ -197,10 +220,16 @@ class Scenario(Settings):
             values["shepherds"] = tuple(
                 untagged(body, BODIES | own, f"Scenario.shepherds[{i}]") for i, body in enumerate(values["shepherds"])
             )
-        if "sheep" in values:
+        if isinstance(values.get("sheep"), list):
+            values["sheep"] = tuple(
+                untagged(body, BODIES | own, f"Scenario.sheep[{i}]") for i, body in enumerate(values["sheep"])
+            )
+        elif "sheep" in values:
             values["sheep"] = untagged(values["sheep"], BODIES | own, "Scenario.sheep")
         if "flock" in values:
             values["flock"] = untagged(values["flock"], FLOCKS | own, "Scenario.flock")
+        if isinstance(values.get("imperfections"), Mapping):
+            values["imperfections"] = Imperfections(**values["imperfections"])
         if "obstacles" in values:
             if not isinstance(values["obstacles"], list):
                 raise SettingsError(f"Scenario.obstacles: must be a list of tables (given: {values['obstacles']!r})")

@@ -123,8 +123,8 @@ class Foreign:
         """The error to raise where the object itself is needed."""
         return SettingsError(
             f"{self.kind!r} is a class of somebody's own and was not handed over: in Python, give it with classes=; "
-            "on the command line, --body module:Name hands over a body, --flock module:Name a flock model, and "
-            "evaluate --scenario module:Name a whole scenario with obstacles or a layout"
+            "on the command line, --body module:Name hands over a body and --flock module:Name a flock model; what has "
+            "an obstacle or a layout of one's own, or several bodies, is itself given as --scenario module:Name"
         )
 
 

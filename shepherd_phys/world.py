@@ -17,8 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from shepherd_phys import _motion
 from shepherd_phys._engine import Engine
-from shepherd_phys.bodies import Disc, built
+from shepherd_phys.bodies import Disc, built, flies
 from shepherd_phys.geometry import (
+    BEAM_CATEGORY,
     OBSTACLE_CATEGORY,
     OBSTACLES,
     SHEEP,
@@ -28,6 +29,7 @@ from shepherd_phys.geometry import (
     Geometry,
     compile_shapes,
 )
+from shepherd_phys.imperfections import disturbed
 from shepherd_phys.layouts import Site, laid_out
 from shepherd_phys.lidar import Lidar, Scan, Sensor
 from shepherd_phys.obstacles import Obstacle, solid
@@ -45,6 +47,9 @@ SHEEP_SETS = {
 
 PLACE_TRIES = 200
 """Draws of a placement among obstacles after which it is given up."""
+
+IMPERFECTIONS_STREAM = 1_000
+"""Spawn key of the streams of imperfect sensing and acting: far from those that an episode's seed spawns."""
 
 HASH_FROM = 1_000
 """Bodies from which the engine finds contacts by a spatial hash and not by its tree: a quarter faster among 10,000. Not
@@ -96,10 +101,12 @@ class World:
         state: the latest `WorldState`; `reset` makes the first.
         space: the pymunk Space of this episode, to look at.
         user_rng: generator for controllers and users, seeded by `reset` apart from the world's own.
+        sensing_rng: the same for what goes wrong with the shepherds' sensors (`shepherd_phys.imperfections.Sight`).
     """
 
     def __init__(self, scenario: Scenario) -> None:
-        for thing in (*scenario.shepherds, scenario.sheep, scenario.flock, *scenario.obstacles, scenario.layout):
+        things = (*scenario.shepherds, *scenario.sheep_kinds, scenario.flock, *scenario.obstacles, scenario.layout)
+        for thing in things:
             if isinstance(thing, Foreign):
                 raise thing.missing()
             if isinstance(thing, type):
@@ -260,6 +267,8 @@ class World:
         self._noise = noise
         self._drawing = drawing
         self.user_rng = users
+        wrong = np.random.SeedSequence(seed, spawn_key=(IMPERFECTIONS_STREAM,)).spawn(2)
+        self.sensing_rng, self._acting_rng = (np.random.default_rng(s) for s in wrong)
         return placement
 
     def _new_bodies(
@@ -271,7 +280,7 @@ class World:
         space.iterations = scenario.iterations
         space.collision_slop = scenario.collision_slop
         self.space = space
-        bodies = [built(scenario.sheep, "sheep") for _ in range(self._n)]
+        bodies = [built(body, "sheep") for body in scenario.sheep_bodies]
         bodies += [built(body, f"shepherd {k}") for k, body in enumerate(scenario.shepherds)]
         return bodies, self._shapes_of(obstacles)
 
@@ -295,6 +304,8 @@ class World:
     ) -> WorldState:
         """Fill the Space and read the first state; rows of ``motion`` are x, y, angle, vx, vy, spin."""
         scenario, space = self.scenario, self.space
+        agents = (*scenario.sheep_bodies, *scenario.shepherds)
+        masks = [BEAM_CATEGORY if flies(body) else pymunk.ShapeFilter.ALL_MASKS() for body in agents]
         self._shapes: list[tuple[pymunk.Shape, int, int]] = []
         for row, (body, shapes, _) in enumerate(bodies):
             is_sheep = row < self._n
@@ -305,7 +316,9 @@ class World:
             body.angle, body.angular_velocity = angle, spin
             for shape in shapes:
                 # a group of its own lets a shepherd's beams pass its own shapes
-                shape.filter = pymunk.ShapeFilter(group=0 if is_sheep else row - self._n + 1, categories=category)
+                shape.filter = pymunk.ShapeFilter(
+                    group=0 if is_sheep else row - self._n + 1, categories=category, mask=masks[row]
+                )
                 shape.collision_type = category
                 self._shapes.append((shape, row, SHEEP if is_sheep else SHEPHERDS))
             space.add(body, *shapes)
@@ -326,7 +339,7 @@ class World:
         if n + p >= HASH_FROM and self._geometry.known:
             space.use_spatial_hash(HASH_CELL * float(np.median(radius)), 4 * (n + p))
         self._speed = frozen(np.array([float(body.max_speed) for body in scenario.shepherds]))
-        self._sheep_speed = frozen(np.full(n, float(scenario.sheep.max_speed)))
+        self._sheep_speed = frozen(np.array([float(body.max_speed) for body in agents[:n]]))
         self._goal = frozen(np.array(goal, dtype=np.float64))
         self._constant = {
             "goal_pos": self._goal,
@@ -343,9 +356,8 @@ class World:
         self._moment = np.array([body.moment for body, _, _ in bodies])
         # a body of infinite moment cannot spin: where that holds for all, angles are neither read nor written
         self._spins = bool(np.isfinite(self._moment).any())
-        self._followers = [(n + k, body) for k, body in enumerate(scenario.shepherds) if type(body) is not Disc]
-        if type(scenario.sheep) is not Disc:
-            self._followers = [(i, scenario.sheep) for i in range(n)] + self._followers
+        self._followers = [(row, body) for row, body in enumerate(agents) if type(body) is not Disc]
+        self._flying = [flies(body) for body in scenario.shepherds]
         self._sensors: dict[Lidar, Sensor] = {}
         self._sensor: Sensor | None = None
 
@@ -378,6 +390,9 @@ class World:
         if action.shape != (self._p, 2):
             raise ValueError(f"action: needs shape ({self._p}, 2), one row a shepherd (given: {action.shape})")
         command = self._command
+        wrong = scenario.imperfections
+        if wrong is not None and wrong.action_noise > 0 and np.isfinite(action).all():
+            action = disturbed(action, wrong.action_noise, self._acting_rng)
         # before the flock draws its random numbers: a refused action must change nothing
         if not _motion.command_shepherds(action, self._speed, command):
             raise NonFiniteError("action: every number must be finite")
@@ -477,7 +492,7 @@ class World:
                 for shape, row, channel in self._shapes:
                     if channel == SHEEP:
                         sheep_shapes[row].append(shape)
-                sensor = Sensor(lidar, self._geometry, self.space, sheep_shapes, self._n, self._p)
+                sensor = Sensor(lidar, self._geometry, self.space, sheep_shapes, self._n, self._p, self._flying)
                 self._sensors[lidar] = sensor
             self._sensor = sensor
         for name in sets:

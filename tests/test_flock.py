@@ -1,5 +1,6 @@
 """The flock's rule: each term by hand, the whole against plain Python, and what must not matter."""
 
+import itertools
 import math
 
 import numpy as np
@@ -8,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shepherd_phys.avoidance import NO_PUSH
-from shepherd_phys.flock import FLOCKS, FlockModel, Strombom, desired
+from shepherd_phys.flock import FLOCKS, FlockModel, Reynolds, Strombom, boids, desired
 from shepherd_phys.settings import SettingsError
 from shepherd_phys.state import WorldState
 
@@ -287,6 +288,135 @@ def test_speeds_are_the_sheeps_own_and_read_only_states_are_accepted():
     assert not state.sheep_max_speed.flags.writeable
     v = Strombom(detection_radius=100).velocities(state, np.random.default_rng(24))
     np.testing.assert_allclose(np.hypot(*v.T), state.sheep_max_speed)
+
+
+# Reynolds
+
+
+SILENT = Reynolds(inertia=0, cohesion=0, alignment=0, separation=0, flight=0)
+
+
+def naive_boids(m, state, draws, pushed=None):
+    """The rule as `Reynolds` states it, one sheep after the other."""
+    sheep, moving, result = state.sheep_pos.tolist(), state.sheep_vel.tolist(), []
+    for i, (x, y) in enumerate(sheep):
+        speed, (u, v) = state.sheep_max_speed[i], moving[i]
+        flights = [
+            unit(x - a, y - b) for a, b in state.shepherd_pos.tolist() if math.hypot(x - a, y - b) <= m.detection_radius
+        ]
+        if not flights:
+            angle, moves = 2 * math.pi * draws[i][1], draws[i][0] < m.graze_probability
+            result.append((speed * math.cos(angle), speed * math.sin(angle)) if moves else (0.0, 0.0))
+            continue
+        others = [(math.hypot(x - a, y - b), j) for j, (a, b) in enumerate(sheep) if j != i]
+        near = [j for d, j in others if d <= m.neighbour_radius]
+        cohesion = unit(sum(sheep[j][0] - x for j in near), sum(sheep[j][1] - y for j in near))
+        alignment = unit(sum(moving[j][0] for j in near), sum(moving[j][1] for j in near))
+        apart = [unit(x - sheep[j][0], y - sheep[j][1]) for d, j in others if d < m.sheep_distance]
+        terms = [
+            (m.inertia / speed, (u, v)), (m.cohesion, cohesion), (m.alignment, alignment),
+            (m.separation, unit(sum(a for a, _ in apart), sum(b for _, b in apart))),
+            (m.flight, unit(sum(a for a, _ in flights), sum(b for _, b in flights))),
+        ]  # fmt: skip
+        terms += [(1.0, pushed[i])] if pushed is not None else []
+        wx, wy = (sum(weight * term[k] for weight, term in terms) for k in range(2))
+        scale = speed / max(1.0, math.hypot(wx, wy))
+        result.append((scale * wx, scale * wy))
+    return np.array(result).reshape(-1, 2)
+
+
+def moving_scene(seed, n_sheep=40, n_shepherds=3, spread=2.0):
+    state = scene(seed, n_sheep, n_shepherds, spread)
+    return state.but(sheep_vel=np.random.default_rng(seed + 1).normal(0, 0.7, (n_sheep, 2)))
+
+
+def test_each_urge_of_a_boid_by_hand():
+    # neighbours of sheep 0 at (1, 1): those at (4, 1) and (1, 5), not the one at (7, 1); two of them move
+    state = world([[1, 1], [4, 1], [1, 5], [7, 1]]).but(sheep_vel=[[0.3, 0.4], [0, 1], [1, 0], [-1, -1]])
+    assert velocities(SILENT.but(inertia=0.5), state)[0] == pytest.approx([0.15, 0.2])
+    assert velocities(SILENT.but(cohesion=0.5), state)[0] == pytest.approx([0.3, 0.4])
+    assert velocities(SILENT.but(alignment=0.5), state)[0] == pytest.approx([0.5 / math.sqrt(2)] * 2)
+    assert velocities(SILENT.but(flight=0.5), state)[0] == pytest.approx([0.5 / math.sqrt(2)] * 2)
+    close = world([[5, 5], [5.3, 5], [5, 4.75], [5, 5.4]])  # the last one, at 0.4 m, is not below it
+    assert velocities(SILENT.but(separation=0.5), close)[0] == pytest.approx([-0.5 / math.sqrt(2), 0.5 / math.sqrt(2)])
+
+
+def test_a_boid_that_wants_more_than_its_top_speed_has_that():
+    state = world([[3, 0], [4, 0]], speed=[0.6, 1.0])
+    assert velocities(Reynolds(), state)[0] == pytest.approx([0.6, 0.0])
+
+
+def test_a_boid_alone_flees_and_one_out_of_sight_grazes():
+    state = world([[0, 9], [0, 10.001]])
+    assert velocities(Reynolds(neighbour_radius=0.5), state)[0] == pytest.approx([0, 1])
+    assert velocities(Reynolds(), state)[1].tolist() == [0, 0]
+    assert velocities(Reynolds(), state, angle=1.0, graze=0.04)[1] == pytest.approx([math.cos(1), math.sin(1)])
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    seed=st.integers(0, 10**6), n_sheep=st.integers(0, 70), n_shepherds=st.integers(0, 6), r=st.floats(0, 8),
+    spread=st.floats(0.2, 12), r_a=st.floats(0, 5),
+)  # fmt: skip
+def test_the_boids_kernel_is_the_rule(seed, n_sheep, n_shepherds, r, spread, r_a):
+    state = moving_scene(seed, n_sheep, n_shepherds, spread)
+    draws = np.random.default_rng(seed).random((n_sheep, 2))
+    model = Reynolds(neighbour_radius=r, sheep_distance=r_a)
+    expected = naive_boids(model, state, draws)
+    np.testing.assert_allclose(model.velocities(state, Draws(draws)), expected, atol=1e-12, rtol=0)
+    pushed = np.random.default_rng(seed).normal(0, 1, (n_sheep, 2))
+    for use_grid, push in itertools.product((False, True), (NO_PUSH, pushed)):
+        v = boids(
+            state.sheep_pos, state.sheep_vel, state.sheep_max_speed, state.shepherd_pos, draws, 0.5, 1.0, 1.0, 1.5, 2.0,
+            r, r_a, 10.0, 0.05, use_grid, push,
+        )  # fmt: skip
+        of_rule = naive_boids(model, state, draws, push) if len(push) else expected
+        np.testing.assert_allclose(v, of_rule, atol=1e-12, rtol=0)
+
+
+def test_many_boids_over_cells_are_the_rule():
+    rng = np.random.default_rng(5)
+    sheep = np.concatenate([rng.normal(0, 6, (380, 2)), rng.normal(0, 200, (20, 2))])
+    state = world(sheep, [[-3, 2], [40, 40]]).but(sheep_vel=rng.normal(0, 1, (400, 2)))
+    model, draws = Reynolds(detection_radius=1e5), rng.random((400, 2))
+    v = model.velocities(state, Draws(draws))
+    np.testing.assert_allclose(v, naive_boids(model, state, draws), atol=1e-11, rtol=0)
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 10**6), turn=st.floats(-4, 4), dx=st.floats(-100, 100), dy=st.floats(-100, 100))
+def test_boids_move_turn_and_change_places_with_the_world(seed, turn, dx, dy):
+    state, rng = moving_scene(seed), np.random.default_rng(seed)
+    draws, order = rng.random((40, 2)), rng.permutation(40)
+    c, s = math.cos(turn), math.sin(turn)
+    rotation = np.array([[c, -s], [s, c]])
+    moved = state.but(
+        sheep_pos=(state.sheep_pos @ rotation.T + [dx, dy])[order],
+        shepherd_pos=state.shepherd_pos @ rotation.T + [dx, dy],
+        sheep_vel=(state.sheep_vel @ rotation.T)[order], sheep_max_speed=state.sheep_max_speed[order],
+    )  # fmt: skip
+    turned = np.column_stack([draws[:, 0], (draws[:, 1] + turn / (2 * math.pi)) % 1.0])[order]
+    model = Reynolds(neighbour_radius=3.0)
+    expected = (model.velocities(state, Draws(draws)) @ rotation.T)[order]
+    np.testing.assert_allclose(model.velocities(moved, Draws(turned)), expected, atol=1e-9)
+
+
+def test_boids_draw_what_strombom_draws():
+    for state in (moving_scene(18, 30, 0), moving_scene(18, 30, 3)):
+        used, expected = np.random.default_rng(19), np.random.default_rng(19)
+        Reynolds().velocities(state, used)
+        expected.random((30, 2))
+        assert used.random() == expected.random()
+
+
+def test_boids_by_name():
+    assert isinstance(Reynolds(), FlockModel)
+    assert FLOCKS["Reynolds"] is Reynolds
+    m = Reynolds()
+    assert (m.inertia, m.cohesion, m.alignment, m.separation, m.flight) == (0.5, 1.0, 1.0, 1.5, 2.0)
+    assert (m.neighbour_radius, m.sheep_distance, m.detection_radius, m.graze_probability) == (5.0, 0.4, 10.0, 0.05)
+    with pytest.raises(SettingsError, match=r"Reynolds.n_neighbours: there is no such field"):
+        Reynolds(n_neighbours=40)
 
 
 # Settings

@@ -23,6 +23,7 @@ ORDER = (
     ("placement", "avoidance"),
     ("layouts",),
     ("flock", "lidar"),
+    ("imperfections",),
     ("scenario",),
     ("world",),
     ("canvas", "cluster", "ledger"),

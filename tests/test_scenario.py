@@ -127,7 +127,7 @@ def test_a_users_class_in_a_file_stays_text_until_it_is_handed_over(tmp_path):
         ("n_sheep = ", "is not a TOML file"),
         ("n_sheep = 0", "Scenario.n_sheep"),
         ("colour = 1", "Scenario.colour: there is no such field"),
-        ("[flock]\nkind = 'Birds'", "Scenario.flock.kind: unknown kind 'Birds'; known: Strombom"),
+        ("[flock]\nkind = 'Birds'", "Scenario.flock.kind: unknown kind 'Birds'; known: Reynolds, Strombom"),
         ("[flock]\nn_neighbours = 3", "Scenario.flock: needs a table with a kind"),
         ("flock = 3", "Scenario.flock: needs a table with a kind"),
         ("[[shepherds]]\nkind = 'Disc'\nwheels = 3", "Disc.wheels: there is no such field"),

@@ -116,6 +116,12 @@ class Late(Chase):
     def __init__(self): 1 / 0
 class Heavy(Disc):
     def __init__(self, **values): raise RuntimeError("too heavy")
+class Stuck(Disc):
+    def follow(self, pose, wanted): return wanted, 0.0
+class Dizzy(Disc):
+    def follow(self, pose, wanted, dt): return wanted, float("nan")
+class Lost(Free):
+    def velocities(self, state, rng): return np.zeros(2)
 class Wild:
     def __init__(self): raise RuntimeError("too wild")
 def maker(): raise KeyError("no")
@@ -534,7 +540,10 @@ MISTAKES = [
     ("--scenario nowhere.toml", "nowhere.toml: cannot be read (No such file or directory)"),
     ("--scenario bad.toml", "bad.toml: is not a TOML file"),
     ("--scenario odd.toml", "Scenario.n_shep: there is no such field"),
-    ("--body nobody", "body: 'nobody' is unknown; there are Disc"),
+    (
+        "--body nobody",
+        "body: 'nobody' is unknown; there are DifferentialDrive, Disc, Flyer, PolygonRobot, Unicycle, or",
+    ),
     ("--body mine:Stone", "body: mine:Stone: lacks build, follow"),
     ("--body mine:Needy", "body: mine:Needy: cannot be made without arguments"),
     ("--body mine:number", "body: mine:number: needs a class (it is a int)"),
@@ -542,8 +551,13 @@ MISTAKES = [
     ("--flock mine:Stone", "flock: mine:Stone: lacks velocities"),
     ("--flock mine:Moody", "mine:Moody: cannot be written, because it does not say what its parameters are"),
     ("--scenario herd.toml --body mine:Cart", "'mine:Crowd' is a class of somebody's own and was not handed over"),
-    ("--scenario herd.toml --flock mine:Crowd", "--body module:Name hands over a body, --flock"),
-    ("--scenario post.toml", "evaluate --scenario module:Name a whole scenario with obstacles"),
+    ("--scenario herd.toml --flock mine:Crowd", "--body module:Name hands over a body and --flock"),
+    ("--scenario post.toml", "an obstacle or a layout of one's own, or several bodies, is itself given"),
+    ("--scenario mine:Chase", "scenario: mine:Chase: needs a Scenario (it is a type)"),
+    ("--scenario mine:Nobody", "scenario: mine:Nobody: module 'mine' has no 'Nobody'"),
+    ("--body mine:Stuck", "TypeError: Stuck.follow() takes 3 positional arguments but 4 were given"),
+    ("--body mine:Dizzy", "Dizzy.follow: velocity and spin must be finite"),
+    ("--flock mine:Lost", "flock model (Lost): velocities need shape (6, 2) (given: (2,))"),
     ("--scenario broken.toml --body mine:Cart", "Scenario.shepherds[0]: mine:Cart: a cart has a size"),
     ("--scenario full.toml", "obstacles"),
     ("--grid nowhere.toml", "nowhere.toml: cannot be read"),

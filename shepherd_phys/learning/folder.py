@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -61,13 +61,15 @@ def _refuse_a_run(folder: Path) -> None:
         raise SettingsError(f"{folder} holds a run: --resume continues it; another run needs another folder")
 
 
-def agree(folder: Path, preset: Preset) -> Preset:
+def agree(folder: Path, preset: Preset, classes: Iterable[Any] = ()) -> Preset:
     """The preset of a folder's run, which must be the one given but for its budget: a longer run is the same run.
+
+    ``classes`` are a user's own that its scenario names.
 
     Raises:
         SettingsError: it is another run, or none that can be read.
     """
-    kept = Preset.from_toml(folder / PRESET)
+    kept = Preset.from_toml(folder / PRESET, classes)
     if kept.but(budget=preset.budget) != preset:
         raise SettingsError(f"{folder}: holds a run with other settings")
     if kept.budget != preset.budget and kept.ppo.last_learning_rate is not None:

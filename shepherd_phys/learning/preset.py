@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -308,8 +308,12 @@ class Preset(Settings):
         return policy
 
     @classmethod
-    def from_dict(cls, table: Mapping[str, Any]) -> Preset:
+    def from_dict(cls, table: Mapping[str, Any], classes: Iterable[Any] = ()) -> Preset:
         """The preset that plain data describe; what is left out keeps its default.
+
+        Args:
+            table: what `to_dict` gives, or parts of it.
+            classes: a user's own classes that its scenario names; nothing is ever imported by name.
 
         Raises:
             SettingsError: a field is unknown or impossible.
@@ -317,6 +321,8 @@ class Preset(Settings):
         values = dict(table)
         if isinstance(values.get("scenario"), str) and values["scenario"] in SCENARIOS:
             values["scenario"] = SCENARIOS[values["scenario"]]
+        if isinstance(values.get("scenario"), Mapping):
+            values["scenario"] = Scenario.from_dict(values["scenario"], classes)
         for name, made in PARTS.items():
             if name in values and not isinstance(values[name], Scenario):
                 if not isinstance(values[name], Mapping):
@@ -328,11 +334,11 @@ class Preset(Settings):
         return cls(**values)
 
     @classmethod
-    def from_toml(cls, path: str | Path) -> Preset:
+    def from_toml(cls, path: str | Path, classes: Iterable[Any] = ()) -> Preset:
         """Read a preset from a TOML file; see `from_dict`."""
         table = read_toml(path)
         try:
-            return cls.from_dict(table)
+            return cls.from_dict(table, classes)
         except SettingsError as error:
             raise SettingsError(f"{path}: {error}") from None
 
@@ -353,8 +359,8 @@ PRESETS = {path.stem: path for path in sorted(FOLDER.glob("*.toml"))}
 """The presets that come with the package, by name."""
 
 
-def load_preset(name_or_path: str | Path) -> Preset:
-    """A preset by its name, or from a TOML file.
+def load_preset(name_or_path: str | Path, classes: Iterable[Any] = ()) -> Preset:
+    """A preset by its name, or from a TOML file; ``classes`` as for `Preset.from_dict`.
 
     Raises:
         SettingsError: it is neither, or the file is not a preset.
@@ -363,5 +369,5 @@ def load_preset(name_or_path: str | Path) -> Preset:
     if name in PRESETS:
         return Preset.from_toml(PRESETS[name])
     if name.endswith(".toml"):
-        return Preset.from_toml(name)
+        return Preset.from_toml(name, classes)
     raise SettingsError(f"preset: {name!r} is neither a .toml file nor one of {', '.join(PRESETS)}")

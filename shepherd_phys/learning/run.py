@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -70,6 +70,7 @@ def train(
     report: Callable[[Progress], None] = lambda _: None,
     seconds: float = math.inf,
     preset: Preset | None = None,
+    classes: Iterable[Any] = (),
 ) -> Chosen | None:
     """Train in a folder, from its last checkpoint if it has one, for as many rollouts as the preset tells.
 
@@ -88,6 +89,7 @@ def train(
         seconds: of training, as in the curve: the run ends with the first checkpoint that reaches them, too.
         preset: the run from now on, which may differ from the folder's in its budget alone; None: as it was. With a
             smaller budget training ends sooner, and the run stays the longer one that it is.
+        classes: a user's own (of bodies, flock models, obstacles) that the folder's scenario names.
 
     Returns:
         the best policy.
@@ -99,7 +101,7 @@ def train(
         CheckpointError: a checkpoint cannot be written, or none of those there can be read, or gone on from.
     """
     with alone(folder):
-        kept = Preset.from_toml(folder / PRESET) if preset is None else agree(folder, preset)
+        kept = Preset.from_toml(folder / PRESET, classes) if preset is None else agree(folder, preset, classes)
         n_rollouts = (preset or kept).n_rollouts
         if preset is None or preset.budget < kept.budget:
             preset = kept

@@ -1,0 +1,154 @@
+"""A user's own classes on the command line: ``module:Name`` becomes a class, and a scenario has things of it."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import inspect
+import os
+import sys
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from shepherd_phys.bodies import BODIES, Body, Disc
+from shepherd_phys.flock import FLOCKS, FlockModel
+from shepherd_phys.scenario import Scenario, load_scenario
+from shepherd_phys.settings import SettingsError, kind_of
+from shepherd_phys.workers import explain
+from shepherd_phys.world import World
+
+
+def find_kinds(body: str | None, flock: str | None) -> dict[str, type[Any]]:
+    """The classes that ``--body`` and ``--flock`` name, where they are given.
+
+    Raises:
+        SettingsError: there is none of a name.
+    """
+    named = {"body": (body, BODIES), "flock": (flock, FLOCKS)}
+    return {where: find_class(name, known, where) for where, (name, known) in named.items() if name is not None}
+
+
+def find_scenario(name: str, classes: Iterable[type[Any]]) -> Scenario:
+    """A preset by its name, from a TOML file, or ``module:Name`` of a user's own or of a function that makes one.
+
+    Raises:
+        SettingsError: there is none.
+    """
+    if ":" not in name or name.endswith(".toml"):
+        return load_scenario(name, classes)
+    own = imported(name, "scenario")
+    if inspect.isroutine(own):
+        try:
+            own = own()
+        except SettingsError:
+            raise
+        except Exception as error:
+            raise SettingsError(f"scenario: {name}: cannot be made: {explain(error)}") from None
+    if not isinstance(own, Scenario):
+        raise SettingsError(f"scenario: {name}: needs a Scenario (it is a {type(own).__name__})")
+    return own
+
+
+def of_kinds(base: Scenario, kinds: Mapping[str, type[Any]]) -> tuple[Scenario, Any]:
+    """A scenario with all shepherds' bodies, or its flock model, of the classes of `find_kinds`.
+
+    What is of the class already stays; everything else becomes one made without arguments.
+
+    Returns:
+        the scenario, and the body of a shepherd that it does not have yet.
+
+    Raises:
+        SettingsError: an object cannot be made, or lacks something.
+    """
+    default: Any = Disc()
+    flock, body = kinds.get("flock"), kinds.get("body")
+    if flock is not None and type(base.flock) is not flock:
+        base = base.but(flock=_made(flock, FlockModel, f"flock: {kind_of(flock)}"))
+    if body is not None and (not base.shepherds or any(type(own) is not body for own in base.shepherds)):
+        default = _made(body, Body, f"body: {kind_of(body)}")
+        base = base.but(shepherds=tuple(own if type(own) is body else default for own in base.shepherds))
+    return base, default
+
+
+def take_step(world: World) -> None:
+    """Let the shepherds of a world that was reset ask for top speed, for one control step.
+
+    Raises:
+        SettingsError: a body or the flock model failed.
+    """
+    try:
+        world.step(np.tile([1.0, 0.0], (world.scenario.n_shepherds, 1)))
+    except SettingsError:
+        raise
+    except Exception as error:
+        raise SettingsError(explain(error)) from None
+
+
+def find_class(name: str, known: dict[str, type[Any]], where: str) -> type[Any]:
+    """A class by its name among ``known`` or by ``module:Name``.
+
+    Raises:
+        SettingsError: there is none.
+    """
+    if ":" not in name:
+        if name not in known:
+            raise SettingsError(
+                f"{where}: {name!r} is unknown; there are {', '.join(sorted(known))}, or module:Name of your own"
+            )
+        return known[name]
+    own = imported(name, where)
+    if not inspect.isclass(own):
+        raise SettingsError(f"{where}: {name}: needs a class (it is a {type(own).__name__})")
+    return own
+
+
+def imported(name: str, where: str) -> Any:
+    """The object ``module:Name``, its module found from the current directory too.
+
+    Raises:
+        SettingsError: it cannot be imported, or the module lacks it.
+    """
+    module_name, _, attribute = name.partition(":")
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())  # at the end: it must not hide an installed package, ours in a checkout included
+    try:
+        module = importlib.import_module(module_name)
+    except (Exception, SystemExit) as error:
+        raise SettingsError(f"{where}: {name}: module {module_name!r} cannot be imported: {explain(error)}") from None
+    if not hasattr(module, attribute):
+        raise SettingsError(f"{where}: {name}: module {module_name!r} has no {attribute!r}")
+    return getattr(module, attribute)
+
+
+def source_hash(thing: Any) -> str | None:
+    """SHA-256 of the file that holds the object's class: an edited class must not find the rows of the old one."""
+    try:
+        path = inspect.getsourcefile(thing if inspect.isclass(thing) or inspect.isroutine(thing) else type(thing))
+        return hashlib.sha256(Path(path or "").read_bytes()).hexdigest()
+    except (TypeError, OSError):
+        return None
+
+
+def _made(cls: type[Any], protocol: type[Any], where: str) -> Any:
+    """An object of the class.
+
+    Raises:
+        SettingsError: it cannot be made without arguments, or lacks something that ``protocol`` asks for.
+    """
+    try:
+        made = cls()
+    except TypeError as error:
+        raise SettingsError(
+            f"{where}: cannot be made without arguments ({error}); a scenario file can give them"
+        ) from None
+    except SettingsError:
+        raise
+    except Exception as error:
+        raise SettingsError(f"{where}: cannot be made: {explain(error)}") from None
+    lacking = [member for member in vars(protocol) if not member.startswith("_") and not hasattr(made, member)]
+    if lacking:
+        raise SettingsError(f"{where}: lacks {', '.join(lacking)}")
+    return made

@@ -1,0 +1,142 @@
+"""The guide's examples of extending: short blocks, all in one file in a folder of its own, on the command line."""
+
+import csv
+import json
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+import tomli_w
+from test_docs import ROOT, blocks
+
+from shepherd_phys.controllers import load_policy
+from shepherd_phys.learning.preset import Preset
+from shepherd_phys.scripts.train import main as train
+from shepherd_phys.settings import Foreign
+
+PAGE = ROOT / "docs" / "extending.md"
+MARK = "# my_file.py\n"
+MINE = [block.removeprefix(MARK) for block in blocks(PAGE, "python") if block.startswith(MARK)]
+COMMAND = Path(sys.executable).with_name("shepherd-phys")
+QUICK = tomllib.loads(blocks(PAGE, "toml")[0])
+TINY = {
+    **QUICK,
+    "worlds": 2,
+    "team_sizes": [2],
+    "budget": 2_400,
+    "checkpoint_rollouts": 15,  # of 2 worlds x 2 shepherds x 8 decisions x 5 control steps = 160
+    "scenario": {"n_sheep": 6, "n_flocks": 2, "shepherds": 2, "n_steps": 60},
+    "ppo": {"n_steps": 8, "batch_size": 16, "n_epochs": 1},
+}
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder away from the checkout, with a user's one file."""
+    (tmp_path / "my_file.py").write_text("\n".join(MINE), encoding="utf-8")
+    (tmp_path / "tiny.toml").write_text(tomli_w.dumps(TINY["scenario"]))
+    (tmp_path / "quick.toml").write_text(tomli_w.dumps(TINY))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [p for p in sys.path if p not in ("", str(ROOT))])
+    yield tmp_path
+    sys.modules.pop("my_file", None)
+
+
+def shell(line):
+    done = subprocess.run([COMMAND, *line.split()], capture_output=True, text=True, timeout=1800, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def rows():
+    with open("results/episodes.csv", newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_an_example_is_a_few_lines_and_there_is_one_of_each():
+    for block in MINE:
+        assert len([line for line in block.splitlines() if line.strip()]) <= 15
+    text = "\n".join(MINE)
+    for what in ("def build", "def act", "def velocities", "def shapes", "after, scan, scenario", "FIELD = SCENARIOS"):
+        assert text.count(what) == 1
+
+
+def test_everything_of_a_users_own_plays_by_its_name(folder):
+    shell("evaluate --controllers my_file:ChaseFarthest --scenario my_file:FIELD --trials 1 --workers 1")
+    (row,) = rows()
+    assert (row["controller"], row["scenario"], row["n_shepherds"]) == ("my_file:ChaseFarthest", "my_file:FIELD", "3")
+    assert row["cohesion"] == ""
+
+
+def test_a_policy_for_a_users_body_is_trained_and_played_from_the_command_line(folder, capsys):
+    shell("train --preset quick.toml --body my_file:Hexapod --out runs/hexapod --workers 2")
+    told = json.loads(Path("runs/hexapod/best.json").read_text())
+    assert {body["kind"] for body in told["scenario"]["shepherds"]} == {"my_file:Hexapod"}
+    policy = load_policy("runs/hexapod/best.json")  # imports nothing
+    assert isinstance(policy.spec.scenario.shepherds[0], Foreign) and "my_file" not in sys.modules
+    assert policy.spec.training["shepherd_steps"] > 2_000
+
+    again = ["--resume", "--out", "runs/hexapod", "--budget", "4800", "--workers", "1"]
+    assert train(again) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "'my_file:Hexapod' is a class of somebody's own and was not handed over" in line
+    assert train([*again, "--body", "my_file:Hexapod"]) == 0
+    from my_file import Hexapod
+
+    assert load_policy("runs/hexapod/policy.json", [Hexapod]).spec.scenario.shepherds == (Hexapod(),) * 2
+    assert load_policy("runs/hexapod/policy.json").spec.training["shepherd_steps"] > 4_000
+
+    shell(
+        "evaluate --controllers runs/hexapod/best.json idle --body my_file:Hexapod --flock my_file:Skittish "
+        "--scenario tiny.toml --trials 1 --workers 1"
+    )
+    assert {row["controller"] for row in rows()} == {"runs/hexapod/best.json", "idle"}
+
+
+def test_the_guides_preset_is_one(folder):
+    preset = Preset.from_dict(QUICK)
+    assert (preset.n_slots, preset.budget) == (48, 50_000)
+
+
+BROKEN = """
+from shepherd_phys.bodies import Disc
+
+class Stone:
+    max_speed = 1.0
+class Stuck(Disc):
+    def follow(self, pose, wanted): return wanted, 0.0
+class Ghost(Disc):
+    def build(self): return None
+class Deaf:
+    def hear(self): ...
+number = 3
+"""
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ("--body my_file:Stone", "body: my_file:Stone: lacks build, follow"),
+        ("--body my_file:Stuck", "TypeError: Stuck.follow() takes 3 positional arguments but 4 were given"),
+        ("--body my_file:Ghost", "shepherd 0 (my_file:Ghost).build: needs a pymunk.Body and a list of its shapes"),
+        ("--body my_file:number", "body: my_file:number: needs a class (it is a int)"),
+        ("--body my_file:Nobody", "body: my_file:Nobody: module 'my_file' has no 'Nobody'"),
+        ("--body Tank", "body: 'Tank' is unknown; there are DifferentialDrive, Disc, Flyer"),
+        ("--flock my_file:Deaf", "flock: my_file:Deaf: lacks velocities"),
+    ],
+)
+def test_train_tells_in_one_line_what_a_class_lacks_and_makes_no_folder(flags, message, folder, capsys):
+    Path("my_file.py").write_text(BROKEN)
+    assert train(["--preset", "quick.toml", "--out", "runs/x", *flags.split()]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("shepherd-phys train: ") and message in line
+    assert not Path("runs").exists()
+
+
+def test_a_preset_with_neighbours_to_draw_refuses_boids_in_one_line(folder, capsys):
+    Path("quick.toml").write_text(tomli_w.dumps({**TINY, "n_neighbours": [3, 9]}))
+    assert train(["--preset", "quick.toml", "--flock", "Reynolds", "--out", "runs/x"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "n_neighbours: Reynolds has none; give None" in line
