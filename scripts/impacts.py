@@ -36,7 +36,7 @@ KINDS: dict[str, Callable[[float], Obstacle]] = {
     "Pillar": lambda y: Pillar((0.0, y), 0.2),
     "Box": lambda y: Box((0.0, y), (MIN_THICKNESS, 1.0), 0.3),
     "Polygon": lambda y: Polygon(((-0.15, y - 0.4), (0.15, y - 0.3), (0.05, y + 0.4))),
-    "Fence": lambda y: Fence((0.0, y - HALF_WALL), (0.0, y + HALF_WALL), gap=0.1, thickness=MIN_THICKNESS),
+    "Fence": lambda y: Fence((0.0, y - HALF_WALL), (0.0, y + HALF_WALL), gap=0.04, thickness=MIN_THICKNESS),
 }
 """Obstacles by kind, as thin as they may be, across the lane at a height y; the fence's gap is too narrow for all."""
 ACROSS = ("Wall", "Fence")

@@ -303,7 +303,7 @@ def test_both_engines_see_a_mixed_team_of_turning_bodies_alike(seed):
 # ------------------------------------------------------------------------ sheep
 
 
-RAM, LAMB = Disc(radius=0.2, mass=3.0, max_speed=0.9), Disc(radius=0.1, mass=0.4, max_speed=0.6)
+RAM, LAMB = Disc(radius=0.2, mass=3.0, max_speed=0.9), Disc(radius=0.12, mass=0.6, max_speed=0.6)
 
 
 def test_sheep_have_their_bodies_in_turn():
@@ -377,8 +377,9 @@ def test_no_body_gets_through_a_thin_wall_or_a_small_pillar(body):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "kinds",
-    [*({"shepherd": body} for body in TEAM[:-1]), {"sheep": RAM}, {"sheep": LAMB}],
-    ids=lambda kinds: "-".join(f"{who}-{type(body).__name__}-{body.mass}" for who, body in kinds.items()),
+    # a lamb is pressed by a shepherd of eight times its mass: the guide says how many engine steps that takes
+    [*({"shepherd": body} for body in TEAM[:-1]), {"sheep": RAM}, {"sheep": LAMB, "substeps": 5}],
+    ids=lambda kinds: "-".join(str(getattr(value, "mass", value)) + who for who, value in kinds.items()),
 )
 def test_none_of_20000_impacts_gets_through(kinds):
     result = impacts(20_000, seed=3, **kinds)
