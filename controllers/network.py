@@ -103,6 +103,27 @@ def input_shape(lidar: Lidar) -> tuple[int, int]:
     return rows, columns
 
 
+def with_channels(weights: Weights, network: SectorNetwork, lidar: Lidar, wanted: Lidar) -> Weights:
+    """Weights for a lidar with more channels, which give the same actions whatever the new ones read.
+
+    Args:
+        weights: of ``network`` for observations of ``lidar``.
+        network: its sizes.
+        lidar: what the weights know.
+        wanted: the same with further channels.
+
+    Raises:
+        SettingsError: the two lidars differ in more than that.
+    """
+    if lidar.but(channels=wanted.channels) != wanted or not set(lidar.channels) <= set(wanted.channels):
+        raise SettingsError(f"lidar: {lidar} cannot become {wanted} by further channels")
+    width = network.group + 2 * network.overlap
+    known = weights["groups.weight"].reshape(network.features, lidar.stack, len(lidar.channels), width)
+    wider = np.zeros((network.features, lidar.stack, len(wanted.channels), width), np.float32)
+    wider[:, :, [wanted.channels.index(name) for name in lidar.channels]] = known
+    return {**weights, "groups.weight": wider.reshape(network.features, -1)}
+
+
 class Actor:
     """The network with its weights, ready to run.
 

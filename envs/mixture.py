@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BeforeValidator, Field
 
+from shepherd_phys.layouts import Scattered
 from shepherd_phys.lidar import Channel
 from shepherd_phys.scenario import Scenario
 from shepherd_phys.settings import Settings, settings
@@ -19,6 +20,7 @@ def _ordered(value: Any) -> Any:
 
 
 Count = Annotated[int, Field(ge=1)]
+Fraction = Annotated[float, Field(ge=0, le=0.5)]
 
 
 @settings
@@ -33,31 +35,46 @@ class Mixture(Settings):
     """Least and most neighbours n to whom a sheep is drawn, the paper's cohesion; None: as in the base, whose flock
     model need not have an ``n_neighbours``."""
 
+    others: tuple[Scenario, ...] = ()
+    """Each episode's base is the base or one of these, all with the same probability."""
+    density: Annotated[tuple[Fraction, Fraction], BeforeValidator(_ordered)] | None = None
+    """Least and largest part of the box that obstacles cover where a base has the layout `Scattered`; None: as it has."""
     uneven: float = Field(default=0.0, ge=0, le=1)
     """Fraction of the episodes whose flocks differ in size: one sheep each, and the others by shares that are drawn
     uniformly from all that there are. In the rest they are equal."""
 
     def __post_init__(self) -> None:
-        if self.n_flocks[1] > self.base.n_sheep:
-            raise ValueError(f"n_flocks may be {self.n_flocks[1]}, more than there are sheep ({self.base.n_sheep})")
-        if self.base.flock_sizes is not None:
-            raise ValueError(f"base.flock_sizes: a mixture draws its own (given: {self.base.flock_sizes})")
-        if self.n_neighbours is not None and not hasattr(self.base.flock, "n_neighbours"):
-            raise ValueError(f"n_neighbours: {type(self.base.flock).__name__} has none; give None")
+        for base in self.bases:
+            if self.n_flocks[1] > base.n_sheep:
+                raise ValueError(f"n_flocks may be {self.n_flocks[1]}, more than there are sheep ({base.n_sheep})")
+            if base.flock_sizes is not None:
+                raise ValueError(f"base.flock_sizes: a mixture draws its own (given: {base.flock_sizes})")
+            if self.n_neighbours is not None and not hasattr(base.flock, "n_neighbours"):
+                raise ValueError(f"n_neighbours: {type(base.flock).__name__} has none; give None")
+        if self.density is not None and not any(isinstance(base.layout, Scattered) for base in self.bases):
+            raise ValueError(f"density: no base scatters obstacles (given: {self.density})")
+
+    @property
+    def bases(self) -> tuple[Scenario, ...]:
+        """All of which one is drawn."""
+        return (self.base, *self.others)
 
     @property
     def channels(self) -> tuple[Channel, ...]:
         """What shepherds observe unless somebody says otherwise; see `Scenario.channels`."""
-        return self.base.channels
+        return max((base.channels for base in self.bases), key=len)
 
     def __call__(self, rng: np.random.Generator, index: int) -> Scenario:
         """The scenario of the next episode; the world's index plays no part."""
         n_flocks = int(rng.integers(*self.n_flocks, endpoint=True))
-        flock = self.base.flock
+        base = self.bases[int(rng.integers(len(self.bases)))] if self.others else self.base
+        flock, layout = base.flock, base.layout
         if self.n_neighbours is not None:
             flock = flock.but(n_neighbours=int(rng.integers(*self.n_neighbours, endpoint=True)))
+        if self.density is not None and isinstance(layout, Scattered):
+            layout = layout.but(count=None, density=float(rng.uniform(*self.density)))
         sizes = None
         if self.uneven and rng.random() < self.uneven:
-            others = rng.multinomial(self.base.n_sheep - n_flocks, rng.dirichlet(np.ones(n_flocks)))
+            others = rng.multinomial(base.n_sheep - n_flocks, rng.dirichlet(np.ones(n_flocks)))
             sizes = tuple(int(1 + more) for more in others)
-        return self.base.but(n_flocks=n_flocks, flock=flock, flock_sizes=sizes)
+        return base.but(n_flocks=n_flocks, flock=flock, flock_sizes=sizes, layout=layout)

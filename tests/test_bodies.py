@@ -309,9 +309,9 @@ RAM, LAMB = Disc(radius=0.2, mass=3.0, max_speed=0.9), Disc(radius=0.12, mass=0.
 def test_sheep_have_their_bodies_in_turn():
     world = World(Scenario(n_sheep=5, n_flocks=1, sheep=(RAM, SHEEP, LAMB)))
     state = world.reset(0)
-    assert state.sheep_radius.tolist() == [0.2, 0.15, 0.1, 0.2, 0.15]
+    assert state.sheep_radius.tolist() == [0.2, 0.15, 0.12, 0.2, 0.15]
     assert state.sheep_max_speed.tolist() == [0.9, 1.0, 0.6, 0.9, 1.0]
-    assert [body.mass for body in world.space.bodies][:5] == [3.0, 1.0, 0.4, 3.0, 1.0]
+    assert [body.mass for body in world.space.bodies][:5] == [3.0, 1.0, 0.6, 3.0, 1.0]
     assert not world._followers  # discs of whatever size stay in the compiled path
     gaps = np.linalg.norm(state.sheep_pos[:, None] - state.sheep_pos[None], axis=2) + 9 * np.eye(5)
     assert (gaps >= state.sheep_radius[:, None] + state.sheep_radius[None]).all()

@@ -92,7 +92,7 @@ class Learner:
         self.rollouts = 0
         """Rollouts learned from since the run began."""
         if start is not None:
-            load_actor(self.policy, start.weights)
+            load_actor(self.policy, start)
             with torch.no_grad():  # what it explored at its end is too little to learn anything new
                 self.policy.log_std.fill_(ppo.log_std_init)
 

@@ -9,8 +9,15 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field
 
-from shepherd_phys.controllers.learned import POLICIES, Policy, load_policy
-from shepherd_phys.controllers.network import SectorNetwork, bytes_of, input_shape, without_scatter
+from shepherd_phys.controllers.learned import POLICIES, load_policy
+from shepherd_phys.controllers.network import (
+    SectorNetwork,
+    Weights,
+    bytes_of,
+    input_shape,
+    with_channels,
+    without_scatter,
+)
 from shepherd_phys.controllers.policy_files import MAX_FRAMES, MAX_WEIGHTS, Acting
 from shepherd_phys.envs.mixture import Mixture
 from shepherd_phys.envs.rewards import SCHEMES, Effort, Gathered, Occlusion, Term
@@ -39,6 +46,9 @@ Counts = Annotated[tuple[Count, ...], Field(min_length=1, max_length=10_000), Be
 Range = Annotated[tuple[Count, Count], BeforeValidator(_listed)]
 Length = Annotated[float, Field(ge=0)]
 Span = Annotated[tuple[Length, Length], BeforeValidator(_listed)]
+Fractions = Annotated[
+    tuple[Annotated[float, Field(ge=0, le=0.5)], Annotated[float, Field(ge=0, le=0.5)]], BeforeValidator(_listed)
+]
 
 
 @settings
@@ -158,8 +168,14 @@ class Preset(Settings):
     """Least and largest distance of a flock's centre from the goal's while learning [m]; none: the scenario's."""
     uneven: float = Field(default=0.0, ge=0, le=1)
     """Fraction of the episodes whose flocks differ in size."""
+    scenarios: Annotated[tuple[str, ...], BeforeValidator(_listed)] = ()
+    """Names of scenarios. Each episode while learning is in the scenario or in one of these, all with the same
+    probability. Validation is in the scenario."""
+    density: Fractions | None = None
+    """Least and largest part of the box that scattered obstacles cover, drawn anew for every episode; none: the
+    scenario's."""
     init: str | None = None
-    """Policy to start from: a shipped one's name, or a .json file."""
+    """Policy to start from: a shipped one's name, or a .json file. It may know fewer channels of the lidar."""
     critic_first: int = Field(default=0, ge=0, le=10**9)
     """Rollouts in which only the critic learns: a fresh one would spoil the policy given as ``init``."""
     critic_sees: Literal["world", "own"] = "world"
@@ -183,6 +199,9 @@ class Preset(Settings):
     def __post_init__(self) -> None:
         if self.reward not in SCHEMES:
             raise ValueError(f"reward: {self.reward!r} is not one of {', '.join(SCHEMES)}")
+        for name in self.scenarios:
+            if name not in SCENARIOS:
+                raise ValueError(f"scenarios: {name!r} is not one of {', '.join(SCENARIOS)}")
         if self.alpha is not None and not any(isinstance(t, Occlusion) for _, t in SCHEMES[self.reward].values()):
             raise ValueError(f"alpha: the reward {self.reward!r} has no occlusion term (given: {self.alpha})")
         if not self.scenario.shepherds:
@@ -267,10 +286,16 @@ class Preset(Settings):
     def draw(self) -> Scenario | Mixture:
         """The scenario, or what draws one for each episode."""
         base = self.scenario.but(flock_distance=self.flock_distance) if self.flock_distance else self.scenario
-        if self.n_flocks is None and self.n_neighbours is None and not self.uneven:
+        if not (self.n_flocks or self.n_neighbours or self.uneven or self.scenarios or self.density):
             return base
-        n_flocks = self.n_flocks or (base.n_flocks, base.n_flocks)
-        return Mixture(base=base, n_flocks=n_flocks, n_neighbours=self.n_neighbours, uneven=self.uneven)
+        return Mixture(
+            base=base,
+            n_flocks=self.n_flocks or (base.n_flocks, base.n_flocks),
+            n_neighbours=self.n_neighbours,
+            others=tuple(SCENARIOS[name] for name in self.scenarios),
+            density=self.density,
+            uneven=self.uneven,
+        )
 
     def scheme(self) -> dict[str, tuple[float, Term]]:
         """The reward scheme, with what the preset changes and adds."""
@@ -289,8 +314,11 @@ class Preset(Settings):
         """How its policy acts when it is deployed."""
         return Acting(frame=self.lidar.frame, rest=self.rest, noise=self.noise, noise_steps=self.decision_interval)
 
-    def start(self) -> Policy | None:
-        """The policy to start from, if there is one.
+    def start(self) -> Weights | None:
+        """Weights of the policy to start from, if there is one.
+
+        A policy that knows fewer of the lidar's channels learns the others from nothing, such as one that never saw
+        obstacles.
 
         Raises:
             SettingsError: it cannot be read, or is not of the preset's lidar and network.
@@ -301,11 +329,14 @@ class Preset(Settings):
         if name not in POLICIES and not name.endswith(".json"):
             raise SettingsError(f"init: {name!r} is neither a .json file nor a shipped policy ({', '.join(POLICIES)})")
         policy = POLICIES[name]() if name in POLICIES else load_policy(name)
-        for part in ("lidar", "network"):
-            theirs, ours = getattr(policy.spec, part), getattr(self, part)
-            if theirs != ours:
-                raise SettingsError(f"init: {name} has another {part} than the preset: {theirs}, not {ours}")
-        return policy
+        if policy.spec.network != self.network:
+            raise SettingsError(
+                f"init: {name} has another network than the preset: {policy.spec.network}, not {self.network}"
+            )
+        try:
+            return with_channels(policy.weights, self.network, policy.spec.lidar, self.lidar)
+        except SettingsError as error:
+            raise SettingsError(f"init: {name} has another lidar than the preset: {error}") from None
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any], classes: Iterable[Any] = ()) -> Preset:
