@@ -38,7 +38,7 @@ class Mixture(Settings):
     others: tuple[Scenario, ...] = ()
     """Each episode's base is the base or one of these, all with the same probability."""
     density: Annotated[tuple[Fraction, Fraction], BeforeValidator(_ordered)] | None = None
-    """Least and largest part of the box that obstacles cover where a base has the layout `Scattered`; None: as it has."""
+    """Least and largest part of the box that obstacles cover where a base's layout is `Scattered`; None: its own."""
     uneven: float = Field(default=0.0, ge=0, le=1)
     """Fraction of the episodes whose flocks differ in size: one sheep each, and the others by shares that are drawn
     uniformly from all that there are. In the rest they are equal."""

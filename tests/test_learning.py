@@ -12,6 +12,7 @@ from shepherd_phys.controllers.network import Actor, SectorNetwork, input_shape
 from shepherd_phys.controllers.policy_files import Acting, PolicyError
 from shepherd_phys.envs.rewards import SCHEMES, Effort
 from shepherd_phys.envs.team import TeamVecEnv
+from shepherd_phys.layouts import Scattered
 from shepherd_phys.learning.export import actor_weights, load_actor, to_policy, to_sb3
 from shepherd_phys.learning.export import spec_of as spec_of_preset
 from shepherd_phys.learning.network import TeamPolicy
@@ -247,6 +248,40 @@ def test_a_policy_to_start_from_must_fit(tmp_path):
         Learner(TINY.but(init=str(tmp_path / "p.json"), network=SMALL.but(latent=9)))
     with pytest.raises(PolicyError, match="cannot be read"):
         Learner(TINY.but(init=str(tmp_path / "q.json")))
+
+
+def test_a_policy_that_never_saw_obstacles_may_learn_about_them(tmp_path):
+    to_policy(policy_of(LIDAR, SMALL, seed=4), spec_of_preset(TINY), tmp_path / "p.json")
+    known = LIDAR.channels
+    preset = TINY.but(scenario=TINY.scenario.but(layout=Scattered(count=2)), init=str(tmp_path / "p.json"))
+    assert preset.lidar.channels == (*known, "obstacles")
+    weights = preset.start()
+    old, new = Actor(SMALL, LIDAR, load_policy(tmp_path / "p.json").weights), Actor(SMALL, preset.lidar, weights)
+    rng = np.random.default_rng(0)
+    rows, columns = input_shape(preset.lidar)
+    seen = rng.random((5, rows, columns)).astype(np.float32)
+    without = seen.reshape(5, LIDAR.stack, len(known) + 1, columns)[:, :, : len(known)].reshape(5, -1, columns)
+    np.testing.assert_allclose(new(seen)[0], old(without)[0], rtol=1e-5, atol=1e-6)
+    learner = Learner(preset)
+    np.testing.assert_array_equal(actor_weights(learner.policy)["groups.weight"], weights["groups.weight"])
+    learner.close()
+    # and not the other way round
+    to_policy(policy_of(preset.lidar, SMALL), spec_of_preset(preset), tmp_path / "q.json")
+    with pytest.raises(
+        SettingsError, match=r"init: .*q.json has another lidar .* cannot become .* by further channels"
+    ):
+        Learner(TINY.but(init=str(tmp_path / "q.json")))
+
+
+def test_a_preset_may_learn_in_several_scenarios():
+    preset = TINY.but(scenarios=("paper", "scattered"), density=(0.0, 0.02))
+    kinds = {preset.draw()(np.random.default_rng(k), 0).layout is None for k in range(30)}
+    assert kinds == {True, False}
+    assert Preset.from_dict(preset.to_dict()) == preset
+    with pytest.raises(SettingsError, match="scenarios: 'moon' is not one of"):
+        TINY.but(scenarios=("moon",))
+    with pytest.raises(SettingsError, match="density: no base scatters"):
+        TINY.but(density=(0.0, 0.02))
 
 
 @pytest.mark.parametrize("where", ["rewards", "lidar", "critic"])

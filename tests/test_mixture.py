@@ -5,6 +5,9 @@ import pytest
 from team_scenes import SMALL
 
 from shepherd_phys.envs.mixture import Mixture
+from shepherd_phys.layouts import Fenced, Scattered
+from shepherd_phys.lidar import CHANNELS
+from shepherd_phys.scenario import SCENARIOS
 from shepherd_phys.settings import SettingsError
 from shepherd_phys.world import World
 
@@ -39,3 +42,31 @@ def test_flocks_of_a_mixture_may_differ_in_size():
     world = World(uneven[0])
     assert world.reset(0).n_sheep == SMALL.n_sheep
     assert all(s.flock_sizes is None for s in (mixture.but(uneven=0.0)(np.random.default_rng(k), 0) for k in range(20)))
+
+
+def test_a_mixture_draws_among_scenarios_and_densities():
+    mixture = Mixture(
+        base=SCENARIOS["scattered"],
+        others=(SCENARIOS["paper"], SCENARIOS["fence"]),
+        n_flocks=(1, 2),
+        density=(0.0, 0.05),
+    )
+    drawn = [mixture(np.random.default_rng(k), 0) for k in range(300)]
+    kinds = [type(s.layout).__name__ for s in drawn]
+    assert {kind: kinds.count(kind) > 70 for kind in set(kinds)} == dict.fromkeys(
+        ("Scattered", "NoneType", "Fenced"), True
+    )
+    covered = [s.layout.density for s in drawn if isinstance(s.layout, Scattered)]
+    assert 0 <= min(covered) < 0.01 and 0.04 < max(covered) <= 0.05
+    fenced = next(s for s in drawn if isinstance(s.layout, Fenced))
+    assert fenced.flock_distance == SCENARIOS["fence"].flock_distance and fenced.flock_spread is not None
+    assert (
+        mixture.channels == CHANNELS
+        and mixture.but(base=SCENARIOS["paper"], density=None, others=()).channels != CHANNELS
+    )
+    with pytest.raises(SettingsError, match="density: no base scatters obstacles"):
+        Mixture(density=(0.0, 0.1))
+    with pytest.raises(SettingsError, match="the smaller number comes first"):
+        mixture.but(density=(0.1, 0.0))
+    with pytest.raises(SettingsError, match="n_flocks may be 90, more than there are sheep"):
+        Mixture(base=SCENARIOS["paper"].but(n_sheep=100), others=(SMALL,), n_flocks=(1, 90))
