@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import io
 import itertools
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import matplotlib.style
 from matplotlib.axes import Axes
@@ -35,6 +36,7 @@ STYLES = {
     "any": (SKY, "v"),
     "wild": (VERMILION, "*"),
     "collie": (BLACK, "P"),
+    "collie-obstacles": (VERMILION, "P"),
     "strombom-literal": (BLUE, "o"),
     "pierson-reconstructed": (GREEN, "s"),
     "elfiqi-literal": (ORANGE, "^"),
@@ -66,6 +68,41 @@ def draw(experiment: Experiment, summary: Sequence[Mapping[str, Any]]) -> bytes:
     return drawn.png
 
 
+def draw_cases(summary: Sequence[Mapping[str, Any]]) -> bytes:
+    """Sheep delivered and path length of each controller in each case, with 95 % intervals, as PNG.
+
+    Args:
+        summary: rows with a ``case``, case by case; controllers are drawn in the order in which they first come.
+    """
+    cases = list(dict.fromkeys(row["case"] for row in summary))
+    methods = list(dict.fromkeys(row["controller"] for row in summary))
+    with picture((SIZE[0], 1.6 + 0.2 * len(cases) * max(2, len(methods)))) as drawn:
+        left, right = drawn.figure.subplots(1, 2, sharey=True)
+        others = iter(OTHERS * len(methods))
+        for k, method in enumerate(methods):
+            style = STYLES[method] if method in STYLES else next(others)
+            rows = [row for row in summary if row["controller"] == method]
+            y = [cases.index(row["case"]) + 0.8 * ((k + 0.5) / len(methods) - 0.5) for row in rows]
+            for axes, metric in ((left, "in_goal_end"), (right, "path_length")):
+                _bars(axes, rows, metric, y, method, style, lying=True)
+        for axes, title in (
+            (left, "sheep in the goal at the end, %"),
+            (right, "path of a shepherd, m (mean of the team)"),
+        ):
+            axes.set_title(title, fontsize=10, loc="left")
+            _tidy(axes, "x")
+            for border in range(len(cases) - 1):
+                axes.axhline(border + 0.5, color="#eeeeee", linewidth=0.8)
+        left.set_xlim(-4.0, 104.0)
+        right.set_xlim(left=0.0)
+        left.set_yticks(range(len(cases)), ["\n".join(textwrap.wrap(case, 26)) for case in cases])
+        left.set_ylim(len(cases) - 0.5, -0.5)
+        drawn.figure.legend(
+            *left.get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False, fontsize=9
+        )
+    return drawn.png
+
+
 @dataclass
 class Drawn:
     """A figure to draw into, and what it has become."""
@@ -75,10 +112,10 @@ class Drawn:
 
 
 @contextmanager
-def picture() -> Iterator[Drawn]:
-    """An empty figure on which users' style sheets have no say; at the end it is PNG."""
+def picture(size: tuple[float, float] = SIZE) -> Iterator[Drawn]:
+    """An empty figure [in] on which users' style sheets have no say; at the end it is PNG."""
     with matplotlib.style.context("default", after_reset=True):
-        drawn = Drawn(Figure(figsize=SIZE, dpi=DPI, layout="constrained"))
+        drawn = Drawn(Figure(figsize=size, dpi=DPI, layout="constrained"))
         FigureCanvasAgg(drawn.figure)
         yield drawn
         file = io.BytesIO()
@@ -95,28 +132,39 @@ def _panel(axes: Axes, experiment: Experiment, summary: Sequence[Mapping[str, An
     for k, method in enumerate(methods):
         rows = [row for row in summary if row["controller"] == method]
         x = [row[experiment.varied] + dodge * (k - 0.5 * (len(methods) - 1)) for row in rows]
-        mean = [row[f"{metric}_mean"] for row in rows]
-        below = [row[f"{metric}_mean"] - row[f"{metric}_low"] for row in rows]
-        above = [row[f"{metric}_high"] - row[f"{metric}_mean"] for row in rows]
-        color, marker = STYLES[method] if method in STYLES else next(others)
-        axes.errorbar(
-            x,
-            mean,
-            yerr=[below, above],
-            label=method,
-            color=color,
-            marker=marker,
-            markersize=7 if marker == "*" else 4.5,
-            markerfacecolor="white" if method in LITERAL else color,
-            linestyle="--" if method in LITERAL else "-",
-            linewidth=0.8,
-            elinewidth=1.3,
-            capsize=2,
-            clip_on=False,
-        )
+        _bars(axes, rows, metric, x, method, STYLES[method] if method in STYLES else next(others))
     axes.set_xticks(ticks)
     axes.set_xlabel(experiment.axis, fontsize=10)
+    _tidy(axes, "y")
+
+
+def _bars(
+    axes: Axes, rows: Sequence[Mapping[str, Any]], metric: str, at: Sequence[float], method: str,
+    style: tuple[str, str], lying: bool = False,
+) -> None:  # fmt: skip
+    """One method's means with their intervals, at places on the other axis; lying: without a line between them."""
+    mean = [row[f"{metric}_mean"] for row in rows]
+    below = [row[f"{metric}_mean"] - row[f"{metric}_low"] for row in rows]
+    above = [row[f"{metric}_high"] - row[f"{metric}_mean"] for row in rows]
+    color, marker = style
+    axes.errorbar(
+        *((mean, at) if lying else (at, mean)),
+        **{"xerr" if lying else "yerr": [below, above]},
+        label=method,
+        color=color,
+        marker=marker,
+        markersize=7 if marker == "*" else 4.5,
+        markerfacecolor="white" if method in LITERAL else color,
+        linestyle="none" if lying else "--" if method in LITERAL else "-",
+        linewidth=0.8,
+        elinewidth=1.3,
+        capsize=2,
+        clip_on=False,
+    )
+
+
+def _tidy(axes: Axes, grid: Literal["x", "y"]) -> None:
     axes.tick_params(labelsize=9)
-    axes.grid(axis="y", color="#dddddd", linewidth=0.6)
+    axes.grid(axis=grid, color="#dddddd", linewidth=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)

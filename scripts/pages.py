@@ -49,27 +49,41 @@ def figure_page(name: str, summary: Sequence[Mapping[str, Any]]) -> str:
     return "\n".join([*lines, ""])
 
 
-def beyond_page(summary: Sequence[Mapping[str, Any]]) -> str:
-    """The table of the worlds that the paper does not have.
+def study_page(name: str, title: str, intro: str, baseline: str | None, summary: Sequence[Mapping[str, Any]]) -> str:
+    """The table of a study of worlds that the paper does not have.
 
     Args:
-        summary: rows of ``beyond.csv``.
+        name: of its files.
+        title: of the page.
+        intro: what the cases are.
+        baseline: the controller with which the others are compared, if any.
+        summary: rows of its CSV.
     """
     trials = _range(row["trials"] for row in summary)
-    titles = [title for title, _ in MEASURES.values()]
+    compared = any(row["ahead_mean"] is not None for row in summary)
+    head = ["case", "controller", MEASURES["in_goal_end"][0], "worst episode, %"]
+    head += [f"`{baseline}` delivers more by"] if compared else []
+    head += [MEASURES["path_length"][0], "95 % in after, s"]
     lines = [
-        "# Beyond the paper's worlds",
+        f"# {title}",
         "",
-        "Each differs in one thing from the paper's world with 2 flocks, 3 shepherds, 100 sheep, n = 40; "
-        f"{trials} trials a point; mean [95 % bootstrap interval]; made by `shepherd-phys reproduce beyond`.",
+        f"![{title}; sheep delivered and path length]({name}.png)",
         "",
-        line(["world", "controller", titles[0], "worst episode, %", titles[1], "95 % in after, s"]),
-        line(["---", "---", *["---:"] * 4]),
+        f"{intro} {trials} trials a point; mean [95 % bootstrap interval]"
+        f"{', differences paired by trial' if compared else ''}; made by `shepherd-phys reproduce {name}`.",
+        "",
+        line(head),
+        line(["---", "---", *["---:"] * (len(head) - 2)]),
     ]
     for row in summary:
         shown = [_interval(row, f"{metric}_mean", f"{metric}_", digits) for metric, (_, digits) in MEASURES.items()]
+        ahead = (
+            [] if not compared else ["" if row["ahead_mean"] is None else _interval(row, "ahead_mean", "ahead_", ".1f")]
+        )
         late = _interval(row, "time_to_95_mean", "time_to_95_", ".0f")
-        lines.append(line([row["case"], f"`{row['controller']}`", shown[0], f"{row[WORST]:.0f}", shown[1], late]))
+        lines.append(
+            line([row["case"], f"`{row['controller']}`", shown[0], f"{row[WORST]:.0f}", *ahead, shown[1], late])
+        )
     return "\n".join([*lines, ""])
 
 

@@ -104,6 +104,7 @@ def points(
     sheep: int | None = None,
     body: str | None = None,
     flock: str | None = None,
+    changes: Mapping[str, Any] | None = None,
 ) -> list[Point]:
     """Every combination; what is left out is the scenario's.
 
@@ -117,6 +118,7 @@ def points(
         body: of all shepherds, a name of `BODIES` or ``module:Name``. Those that a file describes as such a body keep
             their parameters; others become one made without arguments.
         flock: how sheep move, a name of `FLOCKS` or ``module:Name``; its parameters as for ``body``.
+        changes: fields of the scenario that have other values, before all else.
 
     Raises:
         SettingsError: something is unknown or impossible; the message names it.
@@ -125,7 +127,7 @@ def points(
     for name in controllers:
         find_controller(name)
     kinds = find_kinds(body, flock)
-    base = find_scenario(scenario, kinds.values())
+    base = find_scenario(scenario, kinds.values()).but(**(changes or {}))
     if sheep is not None:
         # with the number of flocks, which is checked against it
         base = base.but(n_sheep=sheep, n_flocks=min(base.n_flocks, sheep) if flocks else base.n_flocks)
@@ -134,14 +136,14 @@ def points(
     found = []
     lists = [dict.fromkeys(values) or [None] for values in (flocks, cohesion, shepherds)]  # nothing twice
     for name, n_flocks, n_neighbours, n_shepherds in itertools.product(dict.fromkeys(controllers), *lists):
-        changes: dict[str, Any] = {}
+        varied: dict[str, Any] = {}
         if n_flocks is not None:
-            changes["n_flocks"] = n_flocks
+            varied["n_flocks"] = n_flocks
         if n_neighbours is not None:
-            changes["flock"] = _with_neighbours(base.flock, n_neighbours)
+            varied["flock"] = _with_neighbours(base.flock, n_neighbours)
         if n_shepherds is not None:
-            changes["shepherds"] = _team(base, n_shepherds, default)
-        found.append(Point(name, shown, base.but(**changes)))
+            varied["shepherds"] = _team(base, n_shepherds, default)
+        found.append(Point(name, shown, base.but(**varied)))
     return found
 
 

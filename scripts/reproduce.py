@@ -26,7 +26,7 @@ from shepherd_phys.controllers.summary import summarise, summary_columns
 from shepherd_phys.settings import SettingsError
 
 from . import studies
-from .beyond import beyond
+from .beyond import STUDIES, run_study
 from .command import at_least, cpu_count, fail, flag, parsed, progress_bar, workforce
 from .evaluate import print_table, ready
 from .pages import PART_HEAD, claims_page, few_trials, figure_page, part_cells
@@ -36,11 +36,11 @@ PROG = "shepherd-phys reproduce"
 SCENARIO = "paper"
 EPISODES = (*EXPERIMENTS, "all")
 """Figures made of episodes; all of these."""
-CHOICES = ("figure1", *EPISODES, "beyond", "ablations")
+CHOICES = ("figure1", *EPISODES, *STUDIES, "ablations")
 GOES_WITH = {
     **dict.fromkeys(("literal", "scheduler", "gather"), EPISODES),
-    "controllers": (*EPISODES, "beyond"),
-    **dict.fromkeys(("trials", "seed", "timeout"), ("figure1", *EPISODES, "beyond")),
+    "controllers": (*EPISODES, *STUDIES),
+    **dict.fromkeys(("trials", "seed", "timeout"), ("figure1", *EPISODES, *STUDIES)),
     **dict.fromkeys(("seeds", "budget"), ("figure1", "ablations")),
     "paper_hours": ("figure1",),
 }
@@ -51,11 +51,11 @@ GOES_WITH = {
 class Reproduce:
     """Run the paper's experiments, draw its figures, and judge its claims.
 
-    figure2 and figure3 compare every method that there is, and take some hours; beyond runs the best of them in worlds
-    that the paper does not have; figure1, the learning curves, and ablations, what each ingredient of our recipe buys,
-    train for many hours. all is figure2 and figure3. Writes into
-    the folder --out, for each figure, its CSV, Markdown tables and drawing; claims.json and claims.md; and what lets a
-    stopped run continue: give the same command again.
+    figure2 and figure3 compare every method that there is, and take some hours; beyond, obstacles, bodies, sensing and
+    boids run some of them in worlds that the paper does not have; figure1, the learning curves, and ablations, what
+    each ingredient of our recipe buys, train for many hours. all is figure2 and figure3. Writes into the folder --out,
+    for each figure, its CSV, Markdown tables and drawing; claims.json and claims.md; and what lets a stopped run
+    continue: give the same command again.
     """
 
     figure: Annotated[tyro.conf.Positional[str], flag("|".join(CHOICES), "")] = ""
@@ -108,10 +108,10 @@ def study(options: Reproduce, out: TextIO) -> int:
     figure, folder = options.figure, options.out
     try:
         reported = studies.Reported(SCENARIO, options.trials, options.seed, options.workers, options.timeout)
-        if figure == "beyond":
-            result = beyond(folder, controllers=options.controllers, reported=reported)
+        check_drawing()
+        if figure in STUDIES:
+            result = run_study(figure, folder, controllers=options.controllers, reported=reported)
         else:
-            check_drawing()
             how: dict[str, Any] = {
                 "n_seeds": options.seeds or studies.SEEDS[figure],
                 "budget": options.budget or studies.BUDGETS[figure],

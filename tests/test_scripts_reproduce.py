@@ -19,9 +19,11 @@ from shepherd_phys.controllers import CONTROLLERS
 from shepherd_phys.controllers.claims import EVERYWHERE, EXPERIMENTS, HEURISTICS, LITERAL
 from shepherd_phys.controllers.evaluation import COLUMNS, trial_seed
 from shepherd_phys.controllers.summary import summary_columns
+from shepherd_phys.layouts import Scattered
 from shepherd_phys.scenario import load_scenario
 from shepherd_phys.scripts import beyond, main, reproduce
-from shepherd_phys.scripts.pages import beyond_page, claims_page, figure_page
+from shepherd_phys.scripts.pages import claims_page, figure_page, study_page
+from shepherd_phys.scripts.points import place, points, tasks
 from shepherd_phys.scripts.reproduce import CHOICES, read_options, roster, work
 
 pytest.importorskip("matplotlib")
@@ -249,9 +251,10 @@ def test_work_is_three_shepherds_and_a_hundred_sheep():
 
 # ---- mistakes -------------------------------------------------------------------------------------------------------
 
+WORLDS = ", ".join(beyond.STUDIES)
 MISTAKES = [
     ("", "figure"),
-    ("figure9", "figure: 'figure9' is unknown; there are figure1, figure2, figure3, all, beyond, ablations"),
+    ("figure9", f"figure: 'figure9' is unknown; there are figure1, figure2, figure3, all, {WORLDS}, ablations"),
     ("figure2 figure3", "Unrecognized options: figure3"),
     ("figure2 --trials 0", "trials: 0 is impossible; it must be at least 1"),
     ("figure2 --trials many", "; --trials takes a whole number"),
@@ -263,8 +266,8 @@ MISTAKES = [
     ("figure2 --controllers mine:Nobody", "controllers: mine:Nobody: module 'mine' has no 'Nobody'"),
     ("figure2 --flocks 3", "Unrecognized options: --flocks"),
     ("figure1 --literal", "--literal: goes with figure2, figure3, all, not with figure1"),
-    ("figure1 --controllers idle", "--controllers: goes with figure2, figure3, all, beyond, not with figure1"),
-    ("ablations --trials 5", "--trials: goes with figure1, figure2, figure3, all, beyond, not with ablations"),
+    ("figure1 --controllers idle", f"--controllers: goes with figure2, figure3, all, {WORLDS}, not with figure1"),
+    ("ablations --trials 5", f"--trials: goes with figure1, figure2, figure3, all, {WORLDS}, not with ablations"),
     ("ablations --paper-hours 1", "--paper-hours: goes with figure1, not with ablations"),
     ("ablations --paper_hours=1", "--paper-hours: goes with figure1, not with ablations"),
     ("all --budget 9", "--budget: goes with figure1, ablations, not with all"),
@@ -348,15 +351,14 @@ def test_matplotlib_is_loaded_only_to_draw():
 def test_beyond_runs_each_world_with_each_method(folder, monkeypatch, capsys):
     (folder / "double.toml").write_text(tomli_w.dumps({**TINY, "n_sheep": 12}))
     monkeypatch.setattr(beyond, "PAPER", {**beyond.PAPER, "scenario": "tiny.toml"})
-    monkeypatch.setattr(
-        beyond,
-        "CASES",
-        {name: beyond.CASES[name] for name in ("1 shepherd", "n = 3")} | {"more": {"scenario": "double.toml"}},
-    )
+    study = beyond.STUDIES["beyond"]
+    cases = {name: study.cases[name] for name in ("1 shepherd", "n = 3")} | {"more": {"scenario": "double.toml"}}
+    monkeypatch.setitem(beyond.STUDIES, "beyond", study._replace(cases=cases))
     assert run("beyond", "--controllers", "strombom", "idle", "--json") == 0
     said = json.loads(capsys.readouterr().out)["beyond"]
     table = read("o/beyond.csv")
-    assert tuple(table[0]) == ("case", *summary_columns(), "settings_hash")
+    assert tuple(table[0]) == ("case", *summary_columns(), "ahead_mean", "ahead_low", "ahead_high", "settings_hash")
+    assert {row["ahead_mean"] for row in said} == {None}
     found = [(r["case"], r["controller"], r["n_shepherds"], r["cohesion"], r["n_sheep"], r["trials"]) for r in said]
     assert found == [
         (case, method, *numbers, 2)
@@ -365,7 +367,8 @@ def test_beyond_runs_each_world_with_each_method(folder, monkeypatch, capsys):
     ]
     assert [row["in_goal_end_worst"] for row in said] == [float(row["in_goal_end_worst"]) for row in table]
     page = Path("o/beyond.md").read_text("utf-8")
-    assert page == beyond_page(said)
+    assert page == study_page("beyond", study.title, study.intro, None, said)
+    assert Path("o/beyond.png").read_bytes().startswith(b"\x89PNG")
     assert "| 1 shepherd | `strombom` |" in page and "2 trials a point" in page
     first = contents()
     assert run("beyond", "--controllers", "strombom", "idle") == 0  # nothing is run again
@@ -373,10 +376,40 @@ def test_beyond_runs_each_world_with_each_method(folder, monkeypatch, capsys):
 
 
 def test_the_worlds_beyond_the_paper():
-    assert beyond.roster(["idle"]) == ["idle"]
-    assert set(beyond.roster([])) <= {"occlusion", "wild", "collie"}
+    study = beyond.STUDIES["beyond"]
+    assert beyond.roster(study, ["idle"]) == ["idle"]
+    assert set(beyond.roster(study, [])) <= {"occlusion", "wild", "collie"}
     double = load_scenario("double")
     assert double.n_sheep == 200 and double.goal_radius**2 == pytest.approx(2 * load_scenario("paper").goal_radius ** 2)
+
+
+@pytest.mark.parametrize("name", beyond.STUDIES)
+def test_every_case_of_a_study_can_be_run(name):
+    study = beyond.STUDIES[name]
+    cases = {title: points(controllers=["idle"], **{**beyond.PAPER, **case}) for title, case in study.cases.items()}
+    hashes = {title: tasks(own, [0])[0].settings_hash for title, own in cases.items()}
+    assert len(set(hashes.values())) == len(cases)  # each is another world
+    for (point,) in cases.values():
+        place(point, [1])
+
+
+def test_a_study_tells_how_far_its_baseline_is_ahead(folder, monkeypatch, capsys):
+    cases = {
+        "few": {"scenario": "tiny.toml"},
+        "obstacles": {"scenario": "tiny.toml", "changes": {"layout": Scattered(count=1)}},
+    }
+    study = beyond.STUDIES["obstacles"]._replace(cases=cases, baseline="strombom")
+    monkeypatch.setitem(beyond.STUDIES, "obstacles", study)
+    assert run("obstacles", "--controllers", "idle", "strombom", "--json", "--trials", "3") == 0
+    said = json.loads(capsys.readouterr().out)["obstacles"]
+    rows = {(row["case"], row["controller"]): row for row in said}
+    for case in cases:
+        assert rows[case, "strombom"]["ahead_mean"] is None
+        idle, ours = rows[case, "idle"], rows[case, "strombom"]
+        assert idle["ahead_mean"] == pytest.approx(ours["in_goal_end_mean"] - idle["in_goal_end_mean"])
+        assert idle["ahead_low"] <= idle["ahead_mean"] <= idle["ahead_high"]
+    assert rows["few", "idle"]["settings_hash"] != rows["obstacles", "idle"]["settings_hash"]
+    assert "`strombom` delivers more by" in Path("o/obstacles.md").read_text("utf-8")
 
 
 def test_beyond_refuses_the_flags_of_others(folder, capsys):
