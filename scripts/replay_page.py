@@ -138,6 +138,7 @@ def _episode(replay: Replay, field: tuple[float, float, float]) -> dict[str, Any
             "y": _whole(places[..., 1], y - side / 2, step),
             "speed": _whole(speed, 0.0, top / LEVELS),
             "top_speed": top,
+            "radius": replay.constants[f"{kind}_radius"].tolist(),
         }
     threatened = np.stack([replay.threatened(t) for t in range(len(replay))])
     state = threatened + 2 * replay.states["sheep_arrived"] + 4 * replay.states["sheep_in_goal"]
@@ -206,17 +207,13 @@ def _world(replay: Replay, field: tuple[float, float, float]) -> Any:
     trails = ColumnDataSource({"xs": [], "ys": [], "color": []}, name="trails")
     plot.multi_line("xs", "ys", source=trails, line_color="color", line_width=2, line_alpha=0.55)
 
-    n, p = replay.n_sheep, replay.n_shepherds
     moving: dict[str, Any] = {"number": [], "x": [], "y": [], "speed": [], "away": [], "state": [], "color": []}
-    sheep = ColumnDataSource({**moving, "radius": []}, name="sheep")
-    # at least so large that a sheep is seen in the whole field; the true size when one looks closer
-    seen = np.maximum(replay.constants["sheep_radius"], side / 300)
+    moving["radius"] = []
+    sheep = ColumnDataSource({**moving}, name="sheep")
     drawn = plot.circle(
-        "x", "y", radius="radius", source=sheep, fill_color="color", line_color=THEME.sheep_face, line_width=0.8,
-        hover_line_width=2.5,
+        "x", "y", radius="radius", source=sheep, fill_color="color", line_color=THEME.sheep_face, line_width=0.5,
     )  # fmt: skip
-    team = ColumnDataSource({**moving, "radius": []}, name="shepherds")
-    plot.scatter("x", "y", size=17, source=team, fill_color="color", fill_alpha=0.25, line_color="color")
+    team = ColumnDataSource({**moving}, name="shepherds")
     walking = plot.circle(
         "x", "y", radius="radius", source=team, fill_color="color", line_color=THEME.shepherd_edge, line_width=1.2
     )
@@ -227,12 +224,6 @@ def _world(replay: Replay, field: tuple[float, float, float]) -> Any:
             renderers=[walking], tooltips=[("shepherd", "@number"), *about, ("state", "@state")], name="hover_shepherds"
         ),
     )
-    larger = np.maximum(replay.constants["shepherd_radius"], side / 160)
-    for source, sizes, count in ((sheep, seen, n), (team, larger, p)):
-        source.data = {name: [0] * count for name in source.data}
-        source.data["radius"] = sizes.tolist()
-        source.data["color"] = ["#FFFFFF"] * count
-        source.data["state"] = [""] * count
     return plot
 
 
@@ -265,7 +256,8 @@ def hull(points: Any) -> Any:
 
 def _rewards(replay: Replay) -> Any:
     """The weighted reward terms against time."""
-    plot = _timeline(replay, "rewards", "reward in a step")
+    plot = _timeline(replay, "rewards", "reward / step")
+    plot.xaxis.major_label_text_font_size = "0px"  # the plot below has the same axis
     times = np.arange(1, replay.n_steps + 1) * replay.scenario.control_dt
     for k, (name, values) in enumerate(replay.rewards.items()):
         plot.line(times, values, line_color=TERMS[k % len(TERMS)], line_width=1.6, name=f"term {name}")
@@ -274,7 +266,7 @@ def _rewards(replay: Replay) -> Any:
 
 def _in_goal(replay: Replay) -> Any:
     """Sheep in the goal against time."""
-    plot = _timeline(replay, "in_goal", "sheep in the goal")
+    plot = _timeline(replay, "in_goal", "in the goal")
     times = np.arange(replay.n_steps + 1) * replay.scenario.control_dt
     plot.y_range.start, plot.y_range.end = 0, replay.n_sheep * 1.04
     plot.varea(times, np.zeros(len(times)), replay.in_goal, fill_color=THEME.goal)

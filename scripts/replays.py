@@ -41,9 +41,7 @@ def recorded_episode(folder: str, point: Point, seed: int) -> dict[str, Any]:
     controller = find_controller(point.controller)
     env = ShepherdingEnv(point.scenario, rewards=REWARDS, lidar=controller.lidar)
     try:
-        row, replay = recorded(
-            controller, env, seed, name=point.controller, scenario_name=point.scenario_name
-        )
+        row, replay = recorded(controller, env, seed, name=point.controller, scenario_name=point.scenario_name)
     finally:
         env.close()
     save_replay(replay, Path(folder, file_name(point, point.settings_hash(), seed)))
