@@ -7,6 +7,7 @@ import json
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TextIO
 
@@ -26,6 +27,7 @@ from shepherd_phys.settings import SettingsError, read_toml
 from .command import at_least, cpu_count, fail, flag, parsed, progress_bar, workforce
 from .pictures import picture
 from .points import episode, place, points, table, tasks, write_tables
+from .replays import missing, open_folder, record_again, recorded_episode
 
 PROG = "shepherd-phys evaluate"
 
@@ -75,6 +77,8 @@ class Evaluate:
     """Folder for tables and ledger; an unfinished campaign in it is continued."""
     gather: Annotated[tuple[Path, ...], flag("DIR ..", "")] = ()
     """Folders of other campaigns, such as shards: episodes that they have are taken over and not run."""
+    save_replay: Annotated[Path | None, flag("DIR", "")] = None
+    """Folder that receives a replay of every episode, of earlier runs too; those that it has are kept."""
     json: tyro.conf.FlagCreatePairsOff[bool] = False
     """Print the summary as one JSON array, and nothing else, on standard output."""
 
@@ -104,21 +108,28 @@ def _main(options: Evaluate, out: TextIO) -> int:
         todo = campaign.shard(tasks(grid, seeds), part, count)
     except (SettingsError, ControllerError) as error:
         return fail(PROG, error, 2)
+    replays: Path | None = None
     with progress_bar() as report:
         try:
+            if options.save_replay is not None:
+                replays = open_folder(options.save_replay)
             ledger = ready(options.out, todo, options.gather)
         except (SettingsError, CampaignError) as error:
             return fail(PROG, error, 2)
         with ledger:
+            how: dict[str, Any] = {
+                "workers": workforce(PROG, options.workers, options.scheduler),
+                "timeout": options.timeout,
+                "report": report,
+            }
             try:
-                outcome = campaign.run(
-                    todo,
-                    episode,
-                    workers=workforce(PROG, options.workers, options.scheduler),
-                    ledger=ledger,
-                    timeout=options.timeout,
-                    report=report,
-                )
+                work = episode if replays is None else partial(recorded_episode, str(replays))
+                outcome = campaign.run(todo, work, ledger=ledger, **how)
+                failures = list(outcome.failures)
+                if replays is not None:
+                    kept = {task.key: row for task, row in zip(todo, outcome.rows, strict=True) if row is not None}
+                    again = missing(replays, [task for task in todo if task.key in kept])
+                    failures += record_again(replays, again, [kept[task.key] for task in again], **how)
                 summary, paths = write_tables(options.out, table(todo, outcome), options.baseline)
                 if todo and outcome.rows[0] is not None:
                     paths += picture(todo[0], ledger, PROG)
@@ -135,9 +146,14 @@ def _main(options: Evaluate, out: TextIO) -> int:
         print_differences(summary, out)
     for path in paths:
         print(path, file=sys.stderr if options.json else out)
-    for failure in outcome.failures:
+    lost = 0 if replays is None else len(missing(replays, todo))
+    if replays is not None:
+        print(f"{len(todo) - lost} replays in {options.save_replay}", file=sys.stderr if options.json else out)
+        if lost > len(failures):
+            print(f"{PROG}: {lost} are not there: workers of a cluster must share that folder", file=sys.stderr)
+    for failure in failures:
         print(f"{PROG}: no result in {failure.attempts} attempts: {failure}", file=sys.stderr)
-    return 1 if outcome.failures else 0
+    return 1 if failures or lost else 0
 
 
 def ready(folder: Path, todo: Sequence[campaign.Task], sources: Sequence[Path] = ()) -> Ledger:

@@ -6,9 +6,12 @@ A user adds one by writing a class with a ``shapes`` method.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Annotated, Any, Protocol, runtime_checkable
 
+import numpy as np
 import pymunk
+from numpy.typing import ArrayLike, NDArray
 from pydantic import AfterValidator, Field
 
 from shepherd_phys.settings import Settings, SettingsError, kind_of, settings
@@ -194,3 +197,57 @@ def solid(obstacle: Obstacle, index: int, body: pymunk.Body) -> list[pymunk.Shap
             raise SettingsError(f"{name}.shapes: {type(shape).__name__} is not finite")
         shape.friction = 0.0
     return shapes
+
+
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """A shape as plain numbers: what lies within ``radius`` of the hull of ``points``.
+
+    Raises:
+        SettingsError: that is no shape, or not finite.
+    """
+
+    points: NDArray[np.float64]
+    """(K, 2) a disc's centre, a segment's ends, or a convex polygon's corners, in world coordinates [m]."""
+    radius: float
+    """[m]"""
+
+    def __init__(self, points: ArrayLike, radius: float) -> None:
+        try:
+            given = np.array(points, dtype=np.float64)
+            rounding = float(radius)
+        except (TypeError, ValueError):
+            raise SettingsError("outline: needs points (K, 2) and a radius") from None
+        if given.ndim != 2 or given.shape[1] != 2 or not len(given):
+            raise SettingsError(f"outline: points need shape (K, 2) (given: {given.shape})")
+        if not (np.isfinite(given).all() and math.isfinite(rounding) and rounding >= 0):
+            raise SettingsError("outline: points and radius must be finite, the radius not negative")
+        given.setflags(write=False)
+        object.__setattr__(self, "points", given)
+        object.__setattr__(self, "radius", rounding)
+
+    def shape(self, body: pymunk.Body) -> pymunk.Shape:
+        """A fresh shape of this outline."""
+        corners = [(float(x), float(y)) for x, y in self.points]
+        if len(corners) == 1:
+            return pymunk.Circle(body, self.radius, corners[0])
+        if len(corners) == 2:
+            return pymunk.Segment(body, *corners, self.radius)
+        return pymunk.Poly(body, corners, radius=self.radius)
+
+
+def outlines(obstacle: Obstacle, index: int) -> list[Outline]:
+    """The outlines of all of an obstacle's shapes, whatever class it is of; for pictures and files.
+
+    Raises:
+        SettingsError: it is no obstacle; the message calls it the one of this index.
+    """
+    drawn = []
+    for shape in solid(obstacle, index, pymunk.Body(body_type=pymunk.Body.STATIC)):
+        if isinstance(shape, pymunk.Circle):
+            drawn.append(Outline([shape.offset], shape.radius))
+        elif isinstance(shape, pymunk.Segment):
+            drawn.append(Outline([shape.a, shape.b], shape.radius))
+        elif isinstance(shape, pymunk.Poly):
+            drawn.append(Outline(shape.get_vertices(), shape.radius))
+    return drawn

@@ -26,8 +26,8 @@ ORDER = (
     ("imperfections",),
     ("scenario",),
     ("world",),
-    ("canvas", "cluster", "ledger"),
-    ("campaign",),
+    ("canvas", "cluster", "ledger", "replay"),
+    ("campaign", "replay_file"),
     ("render",),
 )
 RANK = {name: rank for rank, names in enumerate(ORDER) for name in names}
