@@ -1,4 +1,4 @@
-"""Draw measures with intervals, as in the paper's figures, from the rows of a summary. Needs matplotlib (the ``analysis`` extra)."""
+"""Draw measures with intervals, the paper's figures among them. Needs matplotlib (the ``analysis`` extra)."""
 
 from __future__ import annotations
 
@@ -96,11 +96,21 @@ def draw_measures(
             axes.set_title(f"{letter(k, len(metrics))}{title}", fontsize=10, loc="left")
             if "%" in title:
                 axes.set_ylim(-4.0, 104.0)
+            elif title.startswith("share"):
+                axes.set_ylim(-0.04, 1.04)
             else:
                 axes.set_ylim(bottom=0.0)
         drawn.figure.suptitle(about, fontsize=9, x=0.01, ha="left")
         legend(drawn.figure, grid[0])
     return drawn.content
+
+
+def told(labels: Mapping[str, Any]) -> str:
+    """The numbers of a point for people, as far as they are among its labels."""
+    shown = {"n_flocks": "flock", "n_shepherds": "shepherd"}
+    parts = [f"{labels['n_sheep']} sheep"] if labels.get("n_sheep") is not None else []
+    parts += [f"{labels[name]} {word}{'s' * (labels[name] != 1)}" for name, word in shown.items() if name in labels]
+    return ", ".join([*parts, *([f"n = {labels['cohesion']}"] if labels.get("cohesion") is not None else [])])
 
 
 def panels_size(n: int) -> tuple[float, float]:

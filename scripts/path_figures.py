@@ -17,15 +17,15 @@ from matplotlib.patches import Circle, Polygon
 
 from shepherd_phys.obstacles import Obstacle, solid
 from shepherd_phys.placement import flock_of
+from shepherd_phys.render import THEMES
 from shepherd_phys.state import Floats
 
-from .figures import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, picture
+from .figures import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, picture, told
 from .paths import REACH, Frame, Map, Walks, Who
 from .points import Point
 
-GOAL, RING, STONE, INK = "#D3EBD0", "#3E8E4C", "#5A6270", "#2B303A"
-SHEPHERDS = ("#0B4FB3", "#D7191C", "#8A00E6", "#260F26", "#E0007A", "#6B3A00", "#1F0099", "#993D74")
-"""Identities; from the first again after the last."""
+LOOK = THEMES["light"]
+"""The colours of the pictures of `shepherd_phys.render`: a shepherd is the same in all of them."""
 FLOCKS = (ORANGE, SKY, GREEN, PURPLE, GREY, BLUE)
 TIME = LinearSegmentedColormap.from_list("time", ["#F6D98B", "#F0A24B", "#8FBF9F", "#3A9AB0", "#1D5C7A"])
 """Of the sheep: warm while the episode is young, cold when it is old; lighter than any shepherd."""
@@ -75,17 +75,24 @@ def draw_trajectories(point: Point, seed: int, walk: Walks, coloring: Coloring, 
                 [],
                 marker="o",
                 color="none",
-                markeredgecolor=INK,
+                markeredgecolor=LOOK.ink,
                 markerfacecolor="white",
                 markersize=6,
                 label="start",
             ),
             Line2D(
-                [], [], marker="o", color="none", markeredgecolor=INK, markerfacecolor=INK, markersize=6, label="end"
+                [],
+                [],
+                marker="o",
+                color="none",
+                markeredgecolor=LOOK.ink,
+                markerfacecolor=LOOK.ink,
+                markersize=6,
+                label="end",
             ),
         ]
         for p in range(walk.start.n_shepherds):
-            color, path = SHEPHERDS[p % len(SHEPHERDS)], walk.shepherds[:, p]
+            color, path = LOOK.shepherds[p % len(LOOK.shepherds)], walk.shepherds[:, p]
             axes.plot(*path.T, color="white", linewidth=2.6, alpha=0.6, zorder=5)
             axes.plot(*path.T, color=color, linewidth=1.2, zorder=6)
             axes.scatter(*path[0], s=55, facecolors="white", edgecolors=color, linewidths=1.6, zorder=7)
@@ -98,7 +105,14 @@ def draw_trajectories(point: Point, seed: int, walk: Walks, coloring: Coloring, 
             ]
         handles.append(
             Line2D(
-                [], [], marker="o", color="none", markeredgecolor=RING, markerfacecolor=GOAL, markersize=9, label="goal"
+                [],
+                [],
+                marker="o",
+                color="none",
+                markeredgecolor=LOOK.goal_ring,
+                markerfacecolor=LOOK.goal,
+                markersize=9,
+                label="goal",
             )
         )
         _metres(axes, "x, m", "y, m")
@@ -110,7 +124,7 @@ def draw_trajectories(point: Point, seed: int, walk: Walks, coloring: Coloring, 
     return drawn.content
 
 
-def draw_maps(found: Sequence[Map], who: Who, frame: Frame, about: str, kind: str) -> bytes:
+def draw_maps(found: Sequence[Map], who: Who, frame: Frame, about: str, goal_radius: float, kind: str) -> bytes:
     """A map a controller, of seconds per square metre, all with the same colours.
 
     Args:
@@ -118,13 +132,14 @@ def draw_maps(found: Sequence[Map], who: Who, frame: Frame, about: str, kind: st
         who: walked.
         frame: in which.
         about: the scenario in words.
+        goal_radius: [m].
         kind: of file.
     """
     columns = min(3, len(found))
     rows = math.ceil(len(found) / columns)
     most = max(float(one.seconds.max()) for one in found) or 1.0
     norm = LogNorm(most / 1000.0, most)
-    with picture(kind, (3.6 * columns + 1.2, 3.7 * rows + 0.8)) as drawn:
+    with picture(kind, (3.4 * columns + 1.3, 3.35 * rows + 0.8)) as drawn:
         grid = drawn.figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
         for axes in grid.ravel()[len(found) :]:
             axes.set_visible(False)
@@ -138,6 +153,7 @@ def draw_maps(found: Sequence[Map], who: Who, frame: Frame, about: str, kind: st
                 cmap="magma_r",
                 interpolation="nearest",
             )
+            axes.add_patch(Circle((0.0, 0.0), goal_radius, facecolor="none", edgecolor=LOOK.goal_ring, linewidth=1.4))
             axes.set_title(f"{one.controller}: {one.in_goal_end:.1f} % home", fontsize=10, loc="left")
             last = k + columns >= len(found)
             _metres(axes, "x from the goal, m" if last else "", "y from the goal, m" if k % columns == 0 else "")
@@ -169,9 +185,9 @@ def outlines(obstacles: Sequence[Obstacle]) -> list[Floats]:
 def _ground(axes: Axes, goal: Floats, radius: float, stones: Sequence[Floats]) -> None:
     axes.set_axisbelow(True)
     axes.grid(color="#ececec", linewidth=0.6)
-    axes.add_patch(Circle(tuple(goal), radius, facecolor=GOAL, edgecolor=RING, linewidth=1.4, zorder=2))
+    axes.add_patch(Circle(tuple(goal), radius, facecolor=LOOK.goal, edgecolor=LOOK.goal_ring, linewidth=1.4, zorder=2))
     for stone in stones:
-        axes.add_patch(Polygon(stone, facecolor=STONE, edgecolor="none", zorder=9))
+        axes.add_patch(Polygon(stone, facecolor=LOOK.obstacle, edgecolor="none", zorder=9))
 
 
 def _by_time(axes: Axes, walk: Walks) -> None:
@@ -204,17 +220,13 @@ def _metres(axes: Axes, x: str, y: str) -> None:
 
 def _told(point: Point, seed: int, walk: Walks) -> str:
     row = walk.row
+    home = f"{row['in_goal_end']:.0f} % of the sheep in the goal at the end"
     when = f"95 % in after {row['time_to_95']:.0f} s" if row["reached_95"] else "never 95 % in"
-    return (
-        f"{point.controller}, {words(point)}, seed {seed}\n"
-        f"{row['in_goal_end']:.0f} % of the sheep in the goal at the end, {when}, a shepherd's path {row['path_length']:.0f} m"
-    )
+    path = f"a shepherd's path {row['path_length']:.0f} m"
+    return f"{point.controller}, {words(point)}, seed {seed}\n{home}, {when}, {path}"
 
 
 def words(point: Point) -> str:
     """The labels of a scenario for people."""
     labels = point.labels
-    n = "" if labels["cohesion"] is None else f", n = {labels['cohesion']}"
-    flocks = "1 flock" if labels["n_flocks"] == 1 else f"{labels['n_flocks']} flocks"
-    team = "1 shepherd" if labels["n_shepherds"] == 1 else f"{labels['n_shepherds']} shepherds"
-    return f"{labels['scenario']}: {labels['n_sheep']} sheep in {flocks}{n}, {team}"
+    return f"{labels['scenario']}: {told(labels)}"

@@ -23,7 +23,7 @@ from .points import Point, find_controller
 
 REACH = 30.0
 """A map shows places so near to the goal's centre, along each axis [m]."""
-CELL = 0.5
+CELL = 0.75
 """Side of a map's cell [m]."""
 CELLS = round(2 * REACH / CELL)
 """Of a map, along each axis."""

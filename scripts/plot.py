@@ -1,10 +1,11 @@
-"""``shepherd-phys plot KIND ..``: figures of results, of single episodes, of where everybody walks, of training runs."""
+"""``shepherd-phys plot KIND ..``: figures of results, of an episode, of where everybody walks, of training runs."""
 
 from __future__ import annotations
 
 import contextlib
 import csv
 import importlib.util
+import itertools
 import json
 import math
 import os
@@ -55,7 +56,6 @@ VARIED = {
     "sheep": ("n_sheep", "sheep"),
 }
 """Columns by the flags of `evaluate`, and what they are called."""
-SHOWN = {"n_flocks": "flocks: {}", "cohesion": "n = {}", "n_shepherds": "{} shepherds", "n_sheep": "{} sheep"}
 
 
 @dataclass(frozen=True)
@@ -151,9 +151,10 @@ class Heatmap:
 
 @dataclass(frozen=True)
 class Learning:
-    """Draw the learning curves of training runs; seeds of one recipe are averaged, a band reaches from least to most.
+    """Draw the learning curves of training runs, those of one recipe as their mean.
 
-    Runs are of one recipe if their preset.toml differ in seed and budget alone. A mean ends where its shortest run does.
+    Runs are of one recipe if their preset.toml differ in seed and budget alone. A mean ends where its shortest run
+    does; a band reaches from the least run to the most.
     """
 
     runs: Annotated[tyro.conf.Positional[tuple[Path, ...]], flag("DIR ..", "")] = ()
@@ -257,10 +258,10 @@ def draw_measures(options: Measures) -> bytes:
     summary = summarise(rows, options.measure)
     order = options.controllers or tuple(figures.STYLES)
     summary.sort(key=lambda row: order.index(row["controller"]) if row["controller"] in order else len(order))
-    fixed = [SHOWN[name].format(rows[0][name]) for name in SHOWN if name != label and rows[0][name] is not None]
+    fixed = figures.told({name: rows[0][name] for name, _ in VARIED.values() if name != label})
     trials = sorted({row["trials"] for row in summary})
     many = str(trials[0]) if len(trials) == 1 else f"{trials[0]} to {trials[-1]}"
-    about = f"{rows[0]['scenario']}: {', '.join(fixed)}; {many} trials a point; mean with 95 % bootstrap interval"
+    about = f"{rows[0]['scenario']}: {fixed}; {many} trials a point; mean with 95 % bootstrap interval"
     metrics = {name: TITLES[name] for name in options.measure}
     return figures.draw_measures(summary, label, title, metrics, about, kind_of_file(options.out))
 
@@ -385,7 +386,9 @@ def draw_heatmap(options: Heatmap) -> bytes:
     with progress_bar() as report:
         made = maps(found, seeds, options.who, options.frame, workers=options.workers, report=report)
     about = path_figures.words(found[0])
-    return path_figures.draw_maps(made, options.who, options.frame, about, kind_of_file(options.out))
+    return path_figures.draw_maps(
+        made, options.who, options.frame, about, found[0].scenario.goal_radius, kind_of_file(options.out)
+    )
 
 
 def draw_learning(options: Learning) -> bytes:
@@ -439,8 +442,9 @@ def recipes(runs: Sequence[Path]) -> list[tuple[str, Path]]:
     names = []
     for group in alike.values():
         folders = [run.resolve().name for run in group]
-        shared = os.path.commonprefix(folders).rstrip("0123456789-_.") if len(group) > 1 else folders[0]
-        names.append(shared or " and ".join(folders))
+        letters = itertools.takewhile(lambda found: len(set(found)) == 1, zip(*folders, strict=False))
+        shared = "".join(found[0] for found in letters).rstrip("0123456789-_.")
+        names.append(folders[0] if len(folders) == 1 else shared or " and ".join(folders))
     if len(set(names)) < len(names):  # of two recipes the folders are called alike
         names = [", ".join(map(str, group)) for group in alike.values()]
     return [(name, run) for name, group in zip(names, alike.values(), strict=True) for run in group]
