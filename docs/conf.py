@@ -19,8 +19,6 @@ copyright = author
 release = version = __version__
 
 extensions = ["myst_parser", "sphinx.ext.autodoc"]
-# pages that may not be there yet
-suppress_warnings = ["toc.empty_glob"]
 myst_heading_anchors = 3
 
 default_role = "py:obj"  # `Scenario` in a docstring is a link wherever there is such an object
@@ -38,7 +36,7 @@ html_css_files = ["guide.css"]
 html_copy_source = False
 html_show_sphinx = False
 
-SECTIONS = Config(napoleon_numpy_docstring=False, napoleon_use_rtype=False)
+SECTIONS = Config(napoleon_numpy_docstring=False, napoleon_use_rtype=False, napoleon_use_ivar=True)
 LITERAL = re.compile(r"(``.+?``)")
 RULE = re.compile(r"\|[-:| ]+\|")
 

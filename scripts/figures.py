@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import itertools
 import math
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -100,7 +101,7 @@ def draw_measures(
                 axes.set_ylim(-0.04, 1.04)
             else:
                 axes.set_ylim(bottom=0.0)
-        drawn.figure.suptitle(about, fontsize=9, x=0.01, ha="left")
+        heading(drawn.figure, about)
         legend(drawn.figure, grid[0])
     return drawn.content
 
@@ -148,6 +149,12 @@ def picture(kind: str = "png", size: tuple[float, float] = SIZE) -> Iterator[Dra
         file = io.BytesIO()
         drawn.figure.savefig(file, format=kind, metadata=KINDS[kind])
         drawn.content = file.getvalue()
+
+
+def heading(figure: Figure, text: str) -> None:
+    """Say above all panels what they are of, in as many lines as that takes."""
+    lines = [textwrap.fill(line, int(12.5 * figure.get_figwidth())) for line in text.splitlines()]
+    figure.suptitle("\n".join(lines), fontsize=9, x=0.01, ha="left")
 
 
 def legend(figure: Figure, axes: Axes) -> None:

@@ -20,7 +20,7 @@ from shepherd_phys.placement import flock_of
 from shepherd_phys.render import THEMES
 from shepherd_phys.state import Floats
 
-from .figures import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, picture, told
+from .figures import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, heading, picture, told
 from .paths import REACH, Frame, Map, Walks, Who
 from .points import Point
 
@@ -32,6 +32,8 @@ TIME = LinearSegmentedColormap.from_list("time", ["#F6D98B", "#F0A24B", "#8FBF9F
 ROUND = [(math.cos(a), math.sin(a)) for a in np.linspace(0.0, 2.0 * math.pi, 36, endpoint=False)]
 PIECES = 60
 """Of a sheep's path, each of one colour."""
+DECADES = 1e5
+"""Places are told apart that differ by up to this factor."""
 SIDE = 7.0
 """Of the longer side of what is shown [in]."""
 
@@ -69,28 +71,7 @@ def draw_trajectories(point: Point, seed: int, walk: Walks, coloring: Coloring, 
                     *walk.sheep[0, flocks == k].T, s=7, facecolors="white", edgecolors=color, linewidths=0.6, zorder=4
                 )
                 axes.scatter(*walk.sheep[-1, flocks == k].T, s=7, color=color, linewidths=0.0, zorder=4)
-        handles = [
-            Line2D(
-                [],
-                [],
-                marker="o",
-                color="none",
-                markeredgecolor=LOOK.ink,
-                markerfacecolor="white",
-                markersize=6,
-                label="start",
-            ),
-            Line2D(
-                [],
-                [],
-                marker="o",
-                color="none",
-                markeredgecolor=LOOK.ink,
-                markerfacecolor=LOOK.ink,
-                markersize=6,
-                label="end",
-            ),
-        ]
+        handles = [_mark("white", LOOK.ink, "start"), _mark(LOOK.ink, LOOK.ink, "end")]
         for p in range(walk.start.n_shepherds):
             color, path = LOOK.shepherds[p % len(LOOK.shepherds)], walk.shepherds[:, p]
             axes.plot(*path.T, color="white", linewidth=2.6, alpha=0.6, zorder=5)
@@ -103,22 +84,13 @@ def draw_trajectories(point: Point, seed: int, walk: Walks, coloring: Coloring, 
                 Line2D([], [], color=FLOCKS[k % len(FLOCKS)], linewidth=1.6, label=f"flock {k + 1}")
                 for k in range(point.scenario.n_flocks)
             ]
-        handles.append(
-            Line2D(
-                [],
-                [],
-                marker="o",
-                color="none",
-                markeredgecolor=LOOK.goal_ring,
-                markerfacecolor=LOOK.goal,
-                markersize=9,
-                label="goal",
-            )
-        )
+        handles.append(_mark(LOOK.goal, LOOK.goal_ring, "goal"))
+        if walk.start.obstacles:
+            handles.append(Line2D([], [], color=LOOK.obstacle, linewidth=4.0, label="obstacle"))
         _metres(axes, "x, m", "y, m")
         axes.set_xlim(low[0], high[0])
         axes.set_ylim(low[1], high[1])
-        axes.set_title(_told(point, seed, walk), fontsize=9.5, loc="left")
+        heading(drawn.figure, _told(point, seed, walk))
         columns = max(2, min(len(handles), int(drawn.figure.get_figwidth() * 0.85)))
         drawn.figure.legend(handles=handles, loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
     return drawn.content
@@ -137,8 +109,9 @@ def draw_maps(found: Sequence[Map], who: Who, frame: Frame, about: str, goal_rad
     """
     columns = min(3, len(found))
     rows = math.ceil(len(found) / columns)
-    most = max(float(one.seconds.max()) for one in found) or 1.0
-    norm = LogNorm(most / 1000.0, most)
+    entered = np.concatenate([one.seconds[one.seconds > 0.0] for one in found])
+    most = float(entered.max(initial=0.0)) or 1.0
+    norm = LogNorm(max(float(entered.min(initial=most)), most / DECADES), 1.001 * most)
     with picture(kind, (3.4 * columns + 1.3, 3.35 * rows + 0.8)) as drawn:
         grid = drawn.figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
         for axes in grid.ravel()[len(found) :]:
@@ -162,7 +135,7 @@ def draw_maps(found: Sequence[Map], who: Who, frame: Frame, about: str, goal_rad
         bar.set_label(f"time of a {'sheep' if who == 'sheep' else 'shepherd'} in an episode, s per m²", fontsize=9)
         bar.ax.tick_params(labelsize=9)
         where = "; turned so that the sheep's centroid starts straight up" if frame == "flock" else ""
-        drawn.figure.suptitle(f"{about}; {found[0].trials} episodes{where}", fontsize=9.5, x=0.01, ha="left")
+        heading(drawn.figure, f"{about}; {found[0].trials} episodes{where}")
     return drawn.content
 
 
@@ -187,7 +160,7 @@ def _ground(axes: Axes, goal: Floats, radius: float, stones: Sequence[Floats]) -
     axes.grid(color="#ececec", linewidth=0.6)
     axes.add_patch(Circle(tuple(goal), radius, facecolor=LOOK.goal, edgecolor=LOOK.goal_ring, linewidth=1.4, zorder=2))
     for stone in stones:
-        axes.add_patch(Polygon(stone, facecolor=LOOK.obstacle, edgecolor="none", zorder=9))
+        axes.add_patch(Polygon(stone, facecolor=LOOK.obstacle, edgecolor=LOOK.obstacle, linewidth=1.2, zorder=9))
 
 
 def _by_time(axes: Axes, walk: Walks) -> None:
@@ -208,6 +181,12 @@ def _by_time(axes: Axes, walk: Walks) -> None:
     scale = axes.figure.colorbar(ScalarMappable(norm, TIME), ax=axes, shrink=0.7, aspect=30, pad=0.02)
     scale.set_label("sheep: time, s", fontsize=9)
     scale.ax.tick_params(labelsize=9)
+
+
+def _mark(face: str, edge: str, label: str) -> Line2D:
+    return Line2D(
+        [], [], marker="o", color="none", markeredgecolor=edge, markerfacecolor=face, markersize=7, label=label
+    )
 
 
 def _metres(axes: Axes, x: str, y: str) -> None:
