@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import csv
 import importlib.util
 import itertools
 import json
@@ -18,7 +17,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from shepherd_phys.campaign import CampaignError, write_bytes
-from shepherd_phys.controllers.evaluation import LABELS, METRICS, ControllerError, trial_seed
+from shepherd_phys.controllers.evaluation import METRICS, ControllerError, trial_seed
 from shepherd_phys.controllers.summary import summarise
 from shepherd_phys.learning.folder import CURVE, PRESET, VALIDATION
 from shepherd_phys.learning.folder import MEASURES as VALIDATED
@@ -27,6 +26,7 @@ from shepherd_phys.settings import SettingsError, read_toml
 from .command import at_least, cpu_count, fail, flag, parsed, progress_bar
 from .curves import MEASURES as TRAINED
 from .curves import binned, read_rows
+from .episode_tables import VARIED, chosen, once, read_episodes
 from .points import Point, place, points
 
 PROG = "shepherd-phys plot"
@@ -49,13 +49,6 @@ TITLES = {
     "episode_reward": "reward of an episode",
 }
 """Of measures; those in percent have the sign."""
-VARIED = {
-    "flocks": ("n_flocks", "flocks at the start"),
-    "cohesion": ("cohesion", "n, neighbours in a sheep's cohesion"),
-    "shepherds": ("n_shepherds", "shepherds"),
-    "sheep": ("n_sheep", "sheep"),
-}
-"""Columns by the flags of `evaluate`, and what they are called."""
 
 
 @dataclass(frozen=True)
@@ -240,7 +233,8 @@ def draw_measures(options: Measures) -> bytes:
     rows = [row for path in options.tables for row in read_episodes(path)]
     if not options.tables:
         raise SettingsError("needs episodes.csv, or a folder that holds it")
-    rows = once(chosen(rows, options))
+    numbers = {name: getattr(options, name) for name in VARIED}
+    rows = once(chosen(rows, numbers, options.controllers, options.scenario))
     varying = [name for name, (label, _) in VARIED.items() if len({row[label] for row in rows}) > 1]
     if options.against is not None and options.against not in VARIED:
         raise SettingsError(f"against: {options.against!r} is unknown; there are {', '.join(VARIED)}")
@@ -264,70 +258,6 @@ def draw_measures(options: Measures) -> bytes:
     about = f"{rows[0]['scenario']}: {fixed}; {many} trials a point; mean with 95 % bootstrap interval"
     metrics = {name: TITLES[name] for name in options.measure}
     return figures.draw_measures(summary, label, title, metrics, about, kind_of_file(options.out))
-
-
-def read_episodes(path: Path) -> list[dict[str, Any]]:
-    """The rows of an episodes.csv, with numbers as numbers and truth as 1 and 0.
-
-    Raises:
-        SettingsError: it cannot be read, or is no such table.
-    """
-    path = path / "episodes.csv" if path.is_dir() else path
-    rows = []
-    try:
-        with open(path, newline="", encoding="utf-8") as file:
-            for cells in csv.DictReader(file):
-                row: dict[str, Any] = {name: cells[name] for name in ("controller", "scenario", "settings_hash")}
-                for name in (*LABELS[1:-1], "seed"):
-                    row[name] = None if name == "cohesion" and cells[name] == "" else int(cells[name])
-                for name in METRICS:
-                    row[name] = (
-                        {"true": 1.0, "false": 0.0}.get(cells[name])
-                        if cells[name] in ("true", "false")
-                        else float(cells[name])
-                    )
-                rows.append(row)
-    except OSError as error:
-        raise SettingsError(f"{path}: cannot be read ({error.strerror})") from None
-    except (KeyError, TypeError, ValueError) as error:
-        raise SettingsError(f"{path}: is no table of episodes ({type(error).__name__}: {error})") from None
-    if not rows:
-        raise SettingsError(f"{path}: holds no episode")
-    return rows
-
-
-def chosen(rows: Sequence[dict[str, Any]], options: Measures) -> list[dict[str, Any]]:
-    """The rows that were asked for.
-
-    Raises:
-        SettingsError: there is none, for one of the values.
-    """
-    wanted = {label: getattr(options, name) for name, (label, _) in VARIED.items()}
-    wanted |= {"controller": options.controllers, "scenario": (options.scenario,) if options.scenario else ()}
-    for label, values in wanted.items():
-        there = dict.fromkeys(row[label] for row in rows)
-        for value in values:
-            if value not in there:
-                name = next((name for name, (column, _) in VARIED.items() if column == label), f"{label}s")
-                raise SettingsError(f"{name}: no row has {value!r}; there are {', '.join(map(str, there))}")
-        rows = [row for row in rows if not values or row[label] in values]
-    return list(rows)
-
-
-def once(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The rows, those that stand in several tables once.
-
-    Raises:
-        SettingsError: two tables differ about an episode.
-    """
-    found: dict[tuple[Any, ...], dict[str, Any]] = {}
-    for row in rows:
-        key = (*(row[name] for name in LABELS), row["seed"])
-        if found.setdefault(key, row) != row:
-            raise SettingsError(
-                f"the tables differ about {row['controller']}, seed {row['seed']}: not of one experiment"
-            )
-    return list(found.values())
 
 
 def one_point(options: Trajectories | Heatmap, controllers: Sequence[str]) -> list[Point]:
