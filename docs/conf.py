@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from docutils import nodes
-from sphinx.addnodes import pending_xref
+from sphinx.addnodes import desc_annotation, pending_xref
 from sphinx.application import Sphinx
 from sphinx.environment import BuildEnvironment
 from sphinx.ext.napoleon import Config, GoogleDocstring
@@ -37,6 +37,8 @@ html_copy_source = False
 html_show_sphinx = False
 
 SECTIONS = Config(napoleon_numpy_docstring=False, napoleon_use_rtype=False, napoleon_use_ivar=True)
+LONGEST_VALUE = 100
+"""Of what a name is shown to stand for, in characters."""
 LITERAL = re.compile(r"(``.+?``)")
 RULE = re.compile(r"\|[-:| ]+\|")
 
@@ -44,6 +46,7 @@ RULE = re.compile(r"\|[-:| ]+\|")
 def setup(app: Sphinx) -> None:
     """What autodoc and Sphinx do not do of themselves."""
     app.connect("autodoc-process-docstring", read_docstring)
+    app.connect("doctree-read", leave_out_long_values)
     app.connect("missing-reference", find_by_last_name)
 
 
@@ -83,6 +86,13 @@ def escaped(lines: Iterable[str]) -> Iterable[str]:
     for line in lines:
         parts = LITERAL.split(line)
         yield "".join(part if k % 2 else part.replace("|", r"\|") for k, part in enumerate(parts))
+
+
+def leave_out_long_values(app: Sphinx, tree: nodes.document) -> None:
+    """A value that fills a page (all presets, say) is none that anybody reads."""
+    for node in list(tree.findall(desc_annotation)):
+        if node.astext().lstrip().startswith("=") and len(node.astext()) > LONGEST_VALUE:
+            node.parent.remove(node)
 
 
 def find_by_last_name(
