@@ -9,7 +9,7 @@ WORKERS ?= 2
 unexport PYTHONPATH PYTHONHOME PYTHONSTARTUP VIRTUAL_ENV PIP_USER PIP_TARGET PIP_PREFIX
 
 .DELETE_ON_ERROR:
-.PHONY: help run test test-slow lint format benchmark reproduce lock clean clean-kernels .venv FORCE
+.PHONY: help run test test-slow lint format benchmark docs reproduce lock clean clean-kernels .venv FORCE
 
 help:  ## this list
 	@sed -n 's/^\([a-z.-]*\):[^#]*##  *\(.*\)/\1|\2/p' $(MAKEFILE_LIST) | while IFS='|' read -r name text; do printf '  make %-10s %s\n' "$$name" "$$text"; done
@@ -34,6 +34,9 @@ format: build/.installed  ## repair what ruff can repair
 
 benchmark: build/.installed  ## measure the speed of the simulator
 	$(BIN)/shepherd-phys benchmark
+
+docs: build/.installed  ## the guide as pages, in build/docs/html
+	$(BIN)/python -m sphinx -W --keep-going --quiet -d build/docs/doctrees docs build/docs/html
 
 reproduce: build/.installed  ## run the paper's experiments (hours; continues) and put the results into docs/reproduction/
 	$(BIN)/shepherd-phys reproduce all --literal --workers $(WORKERS) --out results/reproduce

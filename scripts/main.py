@@ -14,6 +14,7 @@ COMMANDS = {
     "train": "learn a policy, with checkpoints from which a stopped run goes on",
     "tune": "search the lengths of a heuristic team on tuning seeds",
     "benchmark": "measure how fast the simulator is on this machine",
+    "plot": "draw results, trajectories, heat maps and learning curves",
     "reproduce": "run the paper's experiments, draw its figures and judge its claims",
 }
 """A command is the file of its name in this folder, with ``main(argv) -> exit status``."""
