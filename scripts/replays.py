@@ -83,10 +83,12 @@ def record_again(folder: Path, tasks: Sequence[Task], rows: Sequence[dict[str, A
     Raises:
         CampaignError: no worker can be started or reached.
     """
+    if not tasks:
+        return []
     with tempfile.TemporaryDirectory(prefix="shepherd-phys-") as scratch, Ledger(scratch, __version__) as ledger:
         outcome = campaign.run(tasks, partial(recorded_episode, str(folder)), ledger=ledger, **how)
     failures = list(outcome.failures)
     for task, row, kept in zip(tasks, outcome.rows, rows, strict=True):
         if row is not None and row != kept:
-            failures.append(Failure(task, "the replay's result is another one than the row that was kept", 1))
+            failures.append(Failure(task, "played again, the episode came to another row than the one that is kept", 1))
     return failures

@@ -232,7 +232,7 @@ class Outline:
         if len(corners) == 1:
             return pymunk.Circle(body, self.radius, corners[0])
         if len(corners) == 2:
-            return pymunk.Segment(body, *corners, self.radius)
+            return pymunk.Segment(body, corners[0], corners[1], self.radius)
         return pymunk.Poly(body, corners, radius=self.radius)
 
 

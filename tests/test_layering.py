@@ -37,7 +37,7 @@ ANALYSIS = {"matplotlib", "scipy", "polars"}
 CLUSTER = {"distributed", "dask"}
 # what the simulator does not import; only what analyses may wait inside a function, pygame inside one that draws, and
 # distributed inside one of the cluster's
-FOREIGN = {"gymnasium", "pettingzoo", "pygame"} | TRAINING | ANALYSIS | CLUSTER
+FOREIGN = {"gymnasium", "pettingzoo", "pygame", "bokeh"} | TRAINING | ANALYSIS | CLUSTER
 MAY_TRAIN = ("envs/team.py", "shepherd_phys/learning/", "scripts/train.py")
 
 
@@ -180,7 +180,7 @@ def test_no_file_names_a_place_on_one_machine() -> None:
 
 def test_importing_the_package_is_light() -> None:
     """Numbers only: nothing that trains, draws or analyses is loaded."""
-    heavy = (TRAINING | ANALYSIS | CLUSTER | {"pygame"}) - {
+    heavy = (TRAINING | ANALYSIS | CLUSTER | {"pygame", "bokeh"}) - {
         "scipy"
     }  # numba loads scipy by itself where it is installed
     code = f"""
