@@ -14,7 +14,7 @@ from shepherd_phys.state import Floats, WorldState
 
 ORDER = ("goal", "obstacles", "shepherds", "sheep")
 """Channels whose beams are drawn, what matters most on top."""
-STRENGTH = {"goal": 0.3, "obstacles": 0.3, "shepherds": 0.5, "sheep": 0.5}
+STRENGTH = {"goal": 0.3, "obstacles": 0.18, "shepherds": 0.5, "sheep": 0.5}
 
 
 def beam_ends(origins: Floats, readings: Floats) -> tuple[Floats, Floats]:
