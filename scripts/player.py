@@ -268,7 +268,7 @@ class Player:
             return
         left = k * self._part[0]
         camera = self._cameras()[k]
-        pixels = camera.to_pixels(view.now.state.shepherd_pos, self._part) + (left, 0)
+        pixels = camera.to_pixels(view.now.state.shepherd_pos, self._part) + np.array([left, 0])
         apart = np.hypot(*(pixels - at).T)
         if apart.min() <= GRASP or self.chosen is None or self.chosen[0] != k:
             self.choose(k, int(apart.argmin()))

@@ -76,11 +76,11 @@ def stroke(pixels, starts, ends, half, levels, color):  # type: ignore[no-untype
         reach = (half + 0.5) * math.sqrt(1.0 + slope * slope) + 1.0
         first = min(max(min(main, main + run) - half - 1.0, 0.0), float(size))
         last = min(max(max(main, main + run) + half + 1.0, 0.0), float(size))
-        for i in range(int(first), int(math.ceil(last))):
+        for i in range(int(first), math.ceil(last)):
             middle = other + (min(max(i + 0.5, min(main, main + run)), max(main, main + run)) - main) * slope
             low = min(max(middle - reach, 0.0), float(breadth))
             high = min(max(middle + reach, 0.0), float(breadth))
-            for j in range(int(low), int(math.ceil(high))):
+            for j in range(int(low), math.ceil(high)):
                 row, column = (i, j) if steep else (j, i)
                 if not (y0 <= row < y1 and x0 <= column < x1):
                     continue

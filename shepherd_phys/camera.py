@@ -1,4 +1,4 @@
-"""Which part of the plane a picture shows: `Camera`; `fit`, the one that sees everything; `Smooth`, one that follows."""
+"""Which part of the plane a picture shows: `Camera`; `fit`, the one that sees all; `Smooth`, one that follows."""
 
 from __future__ import annotations
 

@@ -160,7 +160,9 @@ def _draw_drive(canvas: Canvas, body: Any, middle: Floats, size: float, nose: Fl
     """What moves a shepherd of ``size`` [px]: wheels of one that has a track, rotors of one that flies."""
     if body is not None and flies(body):
         for x, y in ((0.9, 0.9), (0.9, -0.9), (-0.9, 0.9), (-0.9, -0.9)):
-            canvas.discs(theme.ground, middle[None] + np.array([x, y]) * size, 0.45 * size, edge=theme.ink, edge_width=1)
+            canvas.discs(
+                theme.ground, middle[None] + np.array([x, y]) * size, 0.45 * size, edge=theme.ink, edge_width=1
+            )
     elif hasattr(body, "track"):
         axle, half = body.track / 2 / body.radius, 0.4
         for side in (-axle, axle):

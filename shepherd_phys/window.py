@@ -66,6 +66,10 @@ class Window:
         """What its user has done since the last call: pygame's events."""
         return list(pygame_ce().event.get())
 
+    def asks_to_close(self, event: Any) -> bool:
+        """Whether an event is its user's wish to close it."""
+        return bool(event.type == pygame_ce().QUIT)
+
     def wait(self, fps: float) -> float:
         """Wait until the next of ``fps`` pictures a second is due; the seconds since the last one."""
         return float(self._clock.tick(fps)) / 1000.0
