@@ -12,7 +12,7 @@ import numpy as np
 from shepherd_phys.camera import Camera, Size, Smooth, fit
 from shepherd_phys.canvas import Canvas, pygame_ce
 from shepherd_phys.lidar import Scan
-from shepherd_phys.overlays import draw_note
+from shepherd_phys.overlays import draw_note, draw_table
 from shepherd_phys.palette import THEMES
 from shepherd_phys.render import paint
 from shepherd_phys.state import Floats, WorldState, frozen
@@ -347,12 +347,12 @@ class Player:
     def _tell(self, whole: Canvas) -> None:
         theme = THEMES[self.theme]
         if self.help:
-            draw_note(whole, [f"{keys}:  {what}" for keys, what in HELP], theme, middle=True)
+            draw_table(whole, HELP, theme)
         told = ["the end: N next, R again"] if self.over else ["paused"] if self.paused else []
         told.append(f"{self.speed:g}x")
         if self.chosen is not None:
             told.append(f"{'you lead' if self.taken else 'chosen:'} shepherd {self.chosen[1] + 1}")
-        draw_note(whole, ["   ".join([*told, "H: keys"])], theme)
+        draw_note(whole, "   ".join([*told, "H: keys"]), theme)
 
 
 _WAYS = {

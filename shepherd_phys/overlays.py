@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -112,17 +112,28 @@ def draw_title(canvas: Canvas, title: str, theme: Theme) -> None:
         y += line.get_height() + 2
 
 
-def draw_note(canvas: Canvas, lines: list[str], theme: Theme, *, middle: bool = False) -> None:
-    """A plate with lines of text, in the lower right, or in the middle of the picture."""
-    w, h = canvas.size
-    size = max(round(text_height(canvas) * 0.58), 14)
-    gap = size // 2
-    drawn = [lettering(line or " ", size, theme.ink) for line in lines]
-    width = max(line.get_width() for line in drawn) + 2 * gap
-    height = sum(line.get_height() + 2 for line in drawn) + 2 * gap
-    left, top = ((w - width) // 2, (h - height) // 2) if middle else (w - width - 10, h - height - 10)
-    canvas.plate(theme.ground, left, top, (width, height), corner=gap / 2, edge=theme.grid[1], alpha=0.92)
-    y = top + gap
-    for line in drawn:
-        canvas.put(line, left + gap, y)
-        y += line.get_height() + 2
+def draw_note(canvas: Canvas, text: str, theme: Theme) -> None:
+    """A plate with a line of text in the lower right."""
+    line = lettering(text, max(round(text_height(canvas) * 0.58), 14), theme.ink)
+    gap = line.get_height() // 2
+    size = line.get_width() + 2 * gap, line.get_height() + 2 * gap
+    left, top = canvas.size[0] - size[0] - 10, canvas.size[1] - size[1] - 10
+    canvas.plate(theme.ground, left, top, size, corner=gap / 2, edge=theme.grid[1], alpha=0.92)
+    canvas.put(line, left + gap, top + gap)
+
+
+def draw_table(canvas: Canvas, rows: Sequence[tuple[str, str]], theme: Theme) -> None:
+    """A plate with two columns of text in the middle."""
+    height = int(np.clip(canvas.size[1] / (1.4 * len(rows)), 12, 22))
+    columns = [
+        [lettering(text, height, color) for text in column]
+        for column, color in zip(zip(*rows, strict=True), (theme.ink, theme.faint_ink), strict=True)
+    ]
+    first, second = (max(text.get_width() for text in column) for column in columns)
+    leading, gap = round(1.25 * height), height
+    size = first + second + 3 * gap, leading * len(rows) + 2 * gap
+    left, top = (canvas.size[0] - size[0]) // 2, (canvas.size[1] - size[1]) // 2
+    canvas.plate(theme.ground, left, top, size, corner=gap / 2, edge=theme.grid[1], alpha=0.95)
+    for row, (key, what) in enumerate(zip(*columns, strict=True)):
+        canvas.put(key, left + gap, top + gap + row * leading)
+        canvas.put(what, left + 2 * gap + first, top + gap + row * leading)

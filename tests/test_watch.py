@@ -1,6 +1,7 @@
 """``shepherd-phys watch`` as a command, its films, and the env's own window and Gymnasium's films."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -39,10 +40,10 @@ def frames_of(path):
         with Image.open(path) as film:
             pictures = np.stack([np.array(frame.convert("RGB")) for frame in ImageSequence.Iterator(film)])
             return pictures, 1000 / film.info["duration"]
-    reader = imageio_ffmpeg.read_frames(str(path))
-    about = next(reader)
-    w, h = about["size"]
-    return np.stack([np.frombuffer(frame, np.uint8).reshape(h, w, 3) for frame in reader]), about["fps"]
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", str(path), "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    done = subprocess.run(command, capture_output=True, check=True)
+    w, h, fps = re.search(r"yuv420p.* (\d+)x(\d+)\W.* ([\d.]+) fps", done.stderr.decode()).groups()
+    return np.frombuffer(done.stdout, np.uint8).reshape(-1, int(h), int(w), 3), float(fps)
 
 
 @pytest.mark.parametrize(
