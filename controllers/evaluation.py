@@ -97,7 +97,7 @@ def run_episode(controller: Controller, env: Env, seed: int) -> dict[str, Any]:
     occupied = 0
     over = False
     while not over:
-        action = _checked(controller.act(observation, state), controller, state)
+        action = checked_action(controller.act(observation, state), controller, state)
         observation, _, terminated, truncated, _ = env.step(action)
         over = bool(terminated) or bool(truncated)
         state = world.state
@@ -190,7 +190,7 @@ def _in_goal(state: WorldState) -> float:
     return int(np.count_nonzero(state.sheep_in_goal)) / state.n_sheep
 
 
-def _checked(action: Any, controller: Controller, state: WorldState) -> NDArray[np.float64]:
+def checked_action(action: Any, controller: Controller, state: WorldState) -> NDArray[np.float64]:
     """The action as (P, 2) finite numbers."""
     where = f"controller {name_of(controller)}, step {state.step}"
     try:

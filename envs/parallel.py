@@ -158,9 +158,9 @@ class ShepherdingParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[np.fl
         return own
 
     def render(self) -> NDArray[np.uint8] | None:
-        """A picture (height, width, 3) of the state, or None without a render mode."""
+        """A picture (height, width, 3) of the state, or None without a render mode and in the window of "human"."""
         return self._env.render()
 
     def close(self) -> None:
-        """Nothing is left open."""
+        """Close the window, if there is one."""
         self._env.close()

@@ -5,7 +5,8 @@ it, and the scenario. It may carry
 
 * ``scans``: names of the scans that it reads: lidar channels ("sheep", "goal", ..) or sets of sheep scanned on their
   own ("wild", "outside"); they are made only where a term asks for them;
-* ``shares(before, after, scan, scenario) -> (P,)``: each shepherd's own share, whose mean is the term's value.
+* ``shares(before, after, scan, scenario) -> (P,)``: each shepherd's own share, whose mean is the term's value;
+* ``earning(scan) -> (P, B)``: lengths of the beams that it pays for [m], infinity for the others, to be drawn.
 
 A scheme is a plain dict ``name -> (weight, term)``; the step's reward is the sum of weight times term, one number for
 the whole team. N sheep, T steps of an episode, P shepherds.
@@ -108,6 +109,12 @@ class Occlusion(Settings):
         counted = np.empty(after.n_shepherds)
         _occluding(scan[seen], scan[goal], self.alpha, self.influence, scenario.n_steps, counted)
         return counted
+
+    def earning(self, scan: Scan) -> Floats:
+        """(P, B) lengths of the beams that count, from the shepherd to the sheep of S [m]; infinity for the others."""
+        sheep, goal = (scan[name] for name in self.scans)
+        counts = (sheep >= self.alpha) & (sheep <= self.influence) & (sheep <= goal) & (goal < np.inf)
+        return np.where(counts, sheep, np.inf)
 
     def __call__(self, before: WorldState, after: WorldState, scan: Scan | None, scenario: Scenario) -> float:
         """Mean of the shares, 0 where there is no shepherd."""
@@ -215,6 +222,12 @@ def scans_for(scheme: Scheme, lidar: Lidar | None) -> tuple[Lidar | None, tuple[
     if sets and not channels:
         channels = CHANNELS[:1]  # a lidar has at least one channel
     return ((lidar or Lidar()).but(channels=channels) if channels else None), sets
+
+
+def earning_beams(scheme: Scheme, scan: Scan | None) -> Floats | None:
+    """(P, B) lengths of the beams for which a scheme pays [m], infinity for the others; None where it pays for none."""
+    lengths = [term.earning(scan) for _, term in scheme.values() if scan is not None and hasattr(term, "earning")]
+    return np.asarray(np.minimum.reduce(lengths)) if lengths else None
 
 
 class Earned(NamedTuple):

@@ -11,15 +11,18 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from shepherd_phys.camera import Smooth
 from shepherd_phys.imperfections import Sight
 from shepherd_phys.lidar import Lidar, Scan, Stack
+from shepherd_phys.palette import THEMES
 from shepherd_phys.scenario import Scenario, load_scenario
 from shepherd_phys.settings import SettingsError
 from shepherd_phys.state import Floats, WorldState
+from shepherd_phys.window import Window
 from shepherd_phys.world import World
 
 from .outcome import HeldSuccess, measures
-from .rewards import Scheme, checked, earned, scans_for
+from .rewards import Scheme, checked, earned, earning_beams, scans_for
 
 
 class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
@@ -94,16 +97,18 @@ class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     | scenario | ``"paper"`` | a `Scenario`, a preset's name or a TOML file |
     | rewards | ``"wild"`` | a scheme or its name; ``{}``: none is computed and the reward is 0 |
     | lidar | ``"default"`` | a `Lidar`; ``None``: no scan is made and observations are empty, (P, 0) |
-    | render_mode | ``None`` | ``"rgb_array"``: pictures of ``render_size`` pixels |
-    | render_size | ``(640, 640)`` | width and height |
+    | render_mode | ``None`` | ``"rgb_array"``: pictures; ``"human"``: a window that shows every step at its own pace |
+    | render_size | ``(640, 640)`` | width and height of the picture or window in pixels |
     | trail_steps | 150 | control steps of the shepherds' trails in a picture |
+    | render_theme | ``"light"`` | or ``"dark"`` |
+    | render_beams | ``False`` | whether to draw the beams of the lidar, and those that earn reward |
 
     ## Version history
 
     * v0: first release. The version is bumped whenever the same seed and actions may give other results.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012 (Gymnasium's form)
+    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 5}  # noqa: RUF012 (Gymnasium's form)
 
     def __init__(
         self,
@@ -113,14 +118,26 @@ class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         render_mode: str | None = None,
         render_size: tuple[int, int] = (640, 640),
         trail_steps: int = 150,
+        render_theme: Literal["light", "dark"] = "light",
+        render_beams: bool = False,
     ) -> None:
         if trail_steps < 0:
             raise SettingsError(f"trail_steps: must not be negative (given: {trail_steps})")
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise SettingsError(f"render_mode: {render_mode!r} is not one of {self.metadata['render_modes']}")
+        if render_theme not in THEMES:
+            raise SettingsError(f"render_theme: {render_theme!r} is not one of {', '.join(THEMES)}")
         self.scenario = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
         self.render_mode = render_mode
         self.render_size = render_size
+        self.render_theme = render_theme
+        self.render_beams = render_beams
+        # in step with the world: films and windows show it as fast as it is
+        self.metadata = {**self.metadata, "render_fps": max(1, round(1.0 / self.scenario.control_dt))}
+        self._camera = Smooth()
+        self._sums: dict[str, float] = {}
+        self._window: Window | None = None
+        self._closed_by_hand = False
         self._scheme = checked(rewards)
         if lidar == "default":
             lidar = Lidar(channels=self.scenario.channels)
@@ -174,6 +191,8 @@ class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.beam_offset = np.zeros(self.scenario.n_shepherds, dtype=np.int64)
         self._trails.clear()
         self._start = state.sheep_pos
+        self._camera.reset()
+        self._sums = dict.fromkeys(self._scheme, 0.0)
         self._scan = self._look()
         if self._stack is not None and self.lidar is not None:
             self._stack.reset()
@@ -183,6 +202,8 @@ class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             zeros.update(dict.fromkeys(keys, 0.0))
         info = {**measures(state), **zeros}
         self._held(state, info["is_success"])
+        if self.render_mode == "human":
+            self.render()
         return self._observe(), info
 
     def step(self, action: Any) -> tuple[NDArray[np.float32], SupportsFloat, bool, bool, dict[str, Any]]:
@@ -204,26 +225,65 @@ class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         for term in earned(self._scheme, before, after, self._scan, self.scenario):
             info[f"reward/{term.name}"] = term.value
             reward += term.value
+            self._sums[term.name] += term.value
             if term.shares is not None:
                 info.update(zip(self._share_keys[term.name], term.shares, strict=True))
         held = self._held(after, info["is_success"])
         terminated = self.scenario.terminate_on_success and held
         truncated = after.step >= self.scenario.n_steps
+        if self.render_mode == "human":
+            self.render()
         return self._observe(), reward, terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
-        """A picture (height, width, 3) of the state, or None without a render mode."""
+        """A picture (height, width, 3) of the state; None without a render mode, and in the window of "human".
+
+        ``reset`` and ``step`` call it by themselves for "human", at the pace of the world. Closing the window ends the
+        showing, not the episode.
+
+        Raises:
+            DisplayError: there is no display for a window.
+            ImportError: pygame-ce is missing.
+        """
         if self.render_mode is None:
             return None
-        from shepherd_phys.render import draw
+        from shepherd_phys.render import fit, paint
 
-        return draw(
-            self.world.state,
-            self.render_size,
-            trails=list(self._trails),
+        human = self.render_mode == "human"
+        if human and self._closed_by_hand:
+            return None
+        if human and self._window is None:
+            self._window = Window(self.render_size, "Shepherding")
+        state = self.world.state
+        size = self._window.size if self._window is not None else self.render_size
+        canvas = paint(
+            state,
+            size,
+            camera=self._camera(fit(state, size, trails=self._trails), state.time),
+            scenario=self.scenario,
+            trails=self._trails,
             start=self._start,
             influence_radius=getattr(self.scenario.flock, "detection_radius", None) or None,
+            scan=self._scan if self.render_beams else None,
+            earning=earning_beams(self._scheme, self._scan) if self.render_beams else None,
+            theme=self.render_theme,
+            rewards=self._sums,
         )
+        if self._window is None:
+            return canvas.picture()
+        self._window.show(canvas)
+        if any(self._window.asks_to_close(event) for event in self._window.events()):
+            self._closed_by_hand = True
+            self.close()
+        else:
+            self._window.wait(self.metadata["render_fps"])
+        return None
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._window is not None:
+            self._window.close()
+            self._window = None
 
     def _look(self) -> Scan | None:
         return self.world.scan(self._scan_lidar, self._sets) if self._scan_lidar is not None else None

@@ -33,6 +33,7 @@ from shepherd_phys.state import WorldState
 from shepherd_phys.world import World
 
 from .command import at_least, fail, parsed
+from .drawing import drawing
 from .impacts import impacts
 from .obstacle_cost import obstacle_cost
 from .plain import PlainWorld
@@ -66,6 +67,8 @@ class Arguments:
     """Instead: compare numbers of substeps and iterations by cost, overlap and impacts."""
     campaign: bool = False
     """Instead: episodes a second of a campaign with one worker and with two."""
+    render: Annotated[int, tyro.conf.arg(metavar="N")] = 0
+    """Instead: N pictures of the paper's world a run, with trails, from a camera that stands and one that moves."""
     controller: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
     """Instead: which part of an episode this controller takes, a policy for example; and episodes a second."""
     seeds: Annotated[int, tyro.conf.arg(metavar="N")] = 4
@@ -324,7 +327,7 @@ def main(argv: list[str]) -> int:
     """Run the command."""
     try:
         args, _ = parsed(Arguments, PROG, argv)
-        at_least(vars(args), {"runs": 1, "steps": 1, "seeds": 1, "impacts": 0, "obstacles": 0})
+        at_least(vars(args), {"runs": 1, "steps": 1, "seeds": 1, "impacts": 0, "obstacles": 0, "render": 0})
     except SettingsError as error:
         return fail(PROG, error, 2)
     result: Any
@@ -339,6 +342,14 @@ def main(argv: list[str]) -> int:
         timed = [acting(controller, args.seeds) for _ in range(args.runs)]
         result = {key: statistics.median(run[key] for run in timed) for key in timed[0]}
         result |= {"controller": args.controller, "episodes": args.seeds, "runs": args.runs}
+    elif args.render:
+        try:
+            drawing(2, SEED)  # compile everything first
+            drawn = [drawing(args.render, SEED + run) for run in range(args.runs)]
+        except ImportError as error:
+            return fail(PROG, error, 2)
+        result = {key: statistics.median(run[key] for run in drawn) for key in drawn[0]}
+        result |= {"pictures": args.render, "runs": args.runs}
     elif args.engine:
         result = compare_engines(args.runs, args.steps, args.impacts or 5_000)
     elif args.obstacles:

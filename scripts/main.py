@@ -11,6 +11,7 @@ from shepherd_phys import __version__
 
 COMMANDS = {
     "evaluate": "run controllers over a grid of experiments and write the tables",
+    "watch": "see controllers at work, live in a window or on film, and take a shepherd over",
     "train": "learn a policy, with checkpoints from which a stopped run goes on",
     "tune": "search the lengths of a heuristic team on tuning seeds",
     "benchmark": "measure how fast the simulator is on this machine",

@@ -17,6 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from shepherd_phys import _pixels
+
 Floats = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 """(h, w, 3) red, green, blue; row 0 at the top."""
@@ -59,6 +61,12 @@ def pygame_ce() -> Any:
 def rgb(color: str) -> Floats:
     """Read ``#rrggbb``: (3,), 0 to 255."""
     return np.array([int(color[k : k + 2], 16) for k in (1, 3, 5)], dtype=np.float64)
+
+
+@lru_cache(maxsize=1024)
+def _parts(color: str) -> tuple[float, float, float]:
+    red, green, blue = rgb(color).tolist()
+    return red, green, blue
 
 
 @lru_cache(maxsize=1024)
@@ -114,13 +122,18 @@ def _plate(size: Size, corner: float, color: str, edge: str, alpha: float) -> Su
     return _stamp(size, points, inset, color, edge, 1.0, alpha)
 
 
-@lru_cache(maxsize=512)
-def lettering(text: str, height: int, color: str) -> Surface:
-    """Set a line of text, ``height`` px high."""
+@lru_cache(maxsize=32)
+def _font(height: int) -> Any:
     font = pygame_ce().font
     if not font.get_init():
         font.init()
-    return font.Font(None, height).render(text, True, color)
+    return font.Font(None, height)
+
+
+@lru_cache(maxsize=512)
+def lettering(text: str, height: int, color: str) -> Surface:
+    """Set a line of text, ``height`` px high."""
+    return _font(height).render(text, True, color)
 
 
 class Canvas:
@@ -128,13 +141,13 @@ class Canvas:
 
     def __init__(self, size: Size, color: str) -> None:
         self.size = size
-        self._surface = pygame_ce().Surface(size, 0, 32, (0xFF0000, 0xFF00, 0xFF, 0))
-        self._surface.fill(color)
+        self.surface = pygame_ce().Surface(size, 0, 32, (0xFF0000, 0xFF00, 0xFF, 0))
+        self.surface.fill(color)
 
     def copy(self) -> Canvas:
         """Copy it, pixels and all."""
         twin = Canvas.__new__(Canvas)
-        twin.size, twin._surface = self.size, self._surface.copy()
+        twin.size, twin.surface = self.size, self.surface.copy()
         return twin
 
     def hull(self, color: str, points: Floats, radius: float, alpha: float = 1.0) -> None:
@@ -143,10 +156,25 @@ class Canvas:
         high = np.clip(np.ceil(points.max(axis=0) + radius + 1), 0, self.size).astype(int)
         if (high <= low).any():
             return
-        x, y = (np.arange(a, b, dtype=np.float64) + 0.5 for a, b in zip(low, high, strict=True))
-        share = alpha * coverage(x, y, points, radius).T[..., None]
-        part = pygame_ce().surfarray.pixels3d(self._surface)[low[0] : high[0], low[1] : high[1]]  # (w, h, 3), a view
-        part[:] = np.rint(part + (rgb(color) - part) * share)
+        _pixels.fill(
+            self._pixels(),
+            tuple(low.tolist()),
+            tuple(high.tolist()),
+            np.ascontiguousarray(points, dtype=float),
+            float(radius),
+            _parts(color),
+            float(alpha),
+        )
+
+    def strokes(self, color: str, starts: Floats, ends: Floats, width: float, levels: Floats) -> None:
+        """Draw lines from ``starts`` to ``ends`` (K, 2), each as strong as its level (K,), 0 to 1.
+
+        Where they cross or join they do not add up: the strongest counts.
+        """
+        far = 1e6  # of what is farther away, the direction may suffer
+        if len(starts):
+            starts, ends = (np.ascontiguousarray(np.clip(at, -far, far)) for at in (starts, ends))
+            _pixels.stroke(self._pixels(), starts, ends, width / 2, np.asarray(levels, dtype=float), _parts(color))
 
     def discs(
         self,
@@ -178,25 +206,25 @@ class Canvas:
         which = (places % SUBPIXELS @ (1, SUBPIXELS)).tolist()
         corners = (places // SUBPIXELS - half).tolist()
         pairs = [(drawn[level][k], corner) for level, k, corner in zip(levels, which, corners, strict=True)]
-        self._surface.fblits(pairs, pygame_ce().BLEND_PREMULTIPLIED)
+        self.surface.fblits(pairs, pygame_ce().BLEND_PREMULTIPLIED)
 
     def plate(
         self, color: str, left: int, top: int, size: Size, *, corner: float, edge: str, alpha: float = 1.0
     ) -> None:
         """Draw a box with round corners and an edge of 1 px."""
         sprite = _plate(size, corner, color, edge, alpha)
-        self._surface.blit(sprite, (left, top), special_flags=pygame_ce().BLEND_PREMULTIPLIED)
+        self.surface.blit(sprite, (left, top), special_flags=pygame_ce().BLEND_PREMULTIPLIED)
 
     def circle(self, color: str, middle: Floats, radius: float) -> None:
         """Draw a line of 1 px round ``middle`` (2,)."""
         far = np.abs(middle - np.clip(middle, 0, self.size)).max() > radius
         if far or radius > 50 * max(self.size):  # out of sight, or so large that pygame would lose count
             return
-        pygame_ce().draw.aalines(self._surface, color, True, (middle - 0.5 + radius * ROUND).tolist())
+        pygame_ce().draw.aalines(self.surface, color, True, (middle - 0.5 + radius * ROUND).tolist())
 
     def box(self, color: str, left: float, top: float, width: float, height: float) -> None:
         """Fill a box, rounded to whole pixels."""
-        self._surface.fill(color, (round(left), round(top), round(width), round(height)))
+        self.surface.fill(color, (round(left), round(top), round(width), round(height)))
 
     def ruling(self, ground: str, color: str, at: Floats, axis: int) -> None:
         """Draw lines of 1 px right across a plain ``ground``, at x (axis 0) or y (axis 1) ``at`` (K,).
@@ -210,19 +238,25 @@ class Canvas:
             rest = round((start - row) * 16) / 16  # few shades, each mixed once
             for part, share in ((row, 1 - rest), (row + 1, rest)):
                 strip = (part, 0, 1, self.size[1]) if axis == 0 else (0, part, self.size[0], 1)
-                self._surface.fill(mixed(ground, color, share), strip, blend)
+                self.surface.fill(mixed(ground, color, share), strip, blend)
+
+    def paste(self, other: Canvas, left: int, top: int) -> None:
+        """Put another canvas here."""
+        self.surface.blit(other.surface, (left, top))
 
     def put(self, surface: Surface, left: float, top: float) -> None:
         """Put lettering here."""
-        self._surface.blit(surface, (round(left), round(top)))
+        self.surface.blit(surface, (round(left), round(top)))
 
     def picture(self) -> Picture:
         """Copy the pixels: uint8 (h, w, 3)."""
-        pixels = pygame_ce().surfarray.pixels3d(self._surface).transpose(1, 0, 2)
-        picture = np.empty(pixels.shape, dtype=np.uint8)
-        for channel in range(3):  # one by one is ten times as fast as all at once, or as array3d
-            picture[..., channel] = pixels[..., channel]
+        picture = np.empty((self.size[1], self.size[0], 3), dtype=np.uint8)
+        _pixels.read(self._pixels(), picture)
         return picture
+
+    def _pixels(self) -> NDArray[np.uint32]:
+        """The pixels themselves, (h, w); they must be let go before pygame draws again."""
+        return np.asarray(pygame_ce().surfarray.pixels2d(self.surface)).T
 
 
 def png(picture: Picture) -> bytes:

@@ -15,7 +15,7 @@ FOLDERS = ("shepherd_phys", "envs", "controllers", "scripts")
 # a state carries those of its world.
 ORDER = (
     ("files",),
-    ("settings", "cells", "neighbours", "workers", "_frames", "_motion", "_shapes", "_raycast"),
+    ("settings", "cells", "neighbours", "workers", "palette", "_frames", "_motion", "_pixels", "_shapes", "_raycast"),
     ("_engine",),
     ("bodies", "obstacles"),
     ("geometry",),
@@ -27,12 +27,13 @@ ORDER = (
     ("scenario",),
     ("world",),
     ("canvas", "cluster", "ledger", "replay"),
-    ("campaign", "replay_file"),
+    ("campaign", "camera", "outlines", "replay_file"),
+    ("overlays", "window", "film"),
     ("render",),
 )
 RANK = {name: rank for rank, names in enumerate(ORDER) for name in names}
 TRAINING = {"torch", "stable_baselines3"}
-DRAWING = {"canvas", "render"}
+DRAWING = {"canvas", "render", "window"}
 ANALYSIS = {"matplotlib", "scipy", "polars"}
 CLUSTER = {"distributed", "dask"}
 # what the simulator does not import; only what analyses may wait inside a function, pygame inside one that draws, and

@@ -97,7 +97,7 @@ def test_render():
     [
         ({"lidar": None}, "lidar: agents need one"),
         ({"credit": "mine"}, "credit: 'mine' is not one of 'team', 'own'"),
-        ({"render_mode": "human"}, "render_mode: 'human' is not one of"),
+        ({"render_mode": "ascii"}, "render_mode: 'ascii' is not one of"),
         ({"rewards": "wool"}, "rewards: 'wool' is not one of original, any, wild"),
     ],
 )

@@ -1,0 +1,200 @@
+"""``shepherd-phys watch``: controllers at work, in a window or on film."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import tyro
+from numpy.typing import NDArray
+
+from shepherd_phys.camera import MAX_SIZE, checked_size
+from shepherd_phys.canvas import pygame_ce
+from shepherd_phys.controllers.evaluation import ControllerError
+from shepherd_phys.envs.rewards import checked
+from shepherd_phys.film import checked_film, write_film
+from shepherd_phys.settings import SettingsError
+from shepherd_phys.window import DisplayError, Window
+
+from .command import at_least, fail, flag, parsed
+from .player import SPEEDS, Player
+from .points import points
+from .sources import Live, Source
+
+PROG = "shepherd-phys watch"
+WINDOW_FPS = 30
+MAX_VIEWS = 2
+
+
+@dataclass(frozen=True)
+class Watch:
+    """Watch controllers at work, live in a window, or write a film of them; H in the window shows the keys.
+
+    Episodes are those of evaluate: trial 0 of --seed first. In the window, arrow keys, W A S D or the mouse take a
+    shepherd over; G gives it back.
+    """
+
+    controllers: Annotated[tuple[str, ...], flag("A [B]")] = ("collie",)
+    """A name, a policy's .json file, or module:Name of your own; two of them play the same episode side by side."""
+    scenario: Annotated[str, flag("NAME|FILE|module:Name")] = "paper"
+    """A preset's name, a TOML file, or module:Name of a scenario of your own."""
+    flocks: Annotated[int | None, flag("K", "the scenario's")] = None
+    """Number of flocks."""
+    cohesion: Annotated[int | None, flag("N", "the scenario's")] = None
+    """Number of neighbours that attract a sheep."""
+    shepherds: Annotated[int | None, flag("M", "the scenario's")] = None
+    """Number of shepherds."""
+    sheep: Annotated[int | None, flag("N", "the scenario's")] = None
+    """Number of sheep."""
+    body: Annotated[str | None, flag("NAME|module:Name", "the scenario's")] = None
+    """Body of every shepherd."""
+    flock: Annotated[str | None, flag("NAME|module:Name", "the scenario's")] = None
+    """Flock model."""
+    seed: Annotated[int, flag("S")] = 20_000
+    """Root seed, as evaluate's."""
+    trial: Annotated[int, flag("I")] = 0
+    """The first episode: trial I of the root seed."""
+    rewards: Annotated[str, flag("NAME")] = "wild"
+    """The scheme whose terms the panel tells, and whose beams are drawn strongest: original, any or wild."""
+    out: Annotated[Path | None, flag("FILE.mp4|FILE.gif", "a window")] = None
+    """Write a film instead of opening a window; it needs no display."""
+    steps: Annotated[int | None, flag("N", "the whole episode")] = None
+    """Control steps of a film."""
+    speed: Annotated[float | None, flag("X", "1; 8 in a film")] = None
+    """Seconds of the world in a second."""
+    fps: Annotated[int, flag("F")] = 25
+    """Pictures a second of a film."""
+    size: Annotated[tuple[int, int], flag("W H")] = (640, 640)
+    """Of the picture of one controller in pixels."""
+    camera: Literal["fit", "follow", "fixed"] = "fit"
+    """Keep everything in sight; stay with the sheep; or stand still."""
+    beams: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Draw the lidar's beams from the start."""
+    dark: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Dark colours."""
+
+
+LEAST = {"flocks": 1, "cohesion": 1, "shepherds": 0, "sheep": 1, "seed": 0, "trial": 0, "steps": 1, "fps": 1}
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run the command; the exit status: 0, 1 if something failed, 2 for a mistake of the user, 130 for Ctrl-C."""
+    try:
+        options = read_options(argv)
+        pygame_ce()
+        if options.out is not None:
+            checked_film(options.out, options.fps)
+    except (ValueError, OSError, ImportError) as error:
+        return fail(PROG, error, 2)
+    with contextlib.redirect_stdout(sys.stderr):  # a user's classes may print wherever they are touched
+        try:
+            sources = live(options)
+            player = make_player(sources, options)
+        except (SettingsError, ControllerError) as error:
+            return fail(PROG, error, 2)
+        try:
+            if options.out is None:
+                run(player, Window(player.size, " and ".join(source.name for source in sources)))
+            else:
+                count = write_film(film(player, options), options.out, options.fps)
+        except DisplayError as error:
+            return fail(PROG, error, 2)
+        except (ControllerError, SettingsError, OSError) as error:
+            return fail(PROG, error, 1)
+    if options.out is not None:
+        print(f"{options.out}  ({count} pictures)")
+    return 0
+
+
+def read_options(argv: Sequence[str]) -> Watch:
+    """The options, checked.
+
+    Raises:
+        SettingsError: one is unknown or impossible.
+        SystemExit: after ``--help``.
+    """
+    options, given = parsed(Watch, PROG, argv)
+    at_least({name: getattr(options, name) for name in LEAST}, LEAST)
+    if not 1 <= len(options.controllers) <= MAX_VIEWS:
+        raise SettingsError(f"controllers: one or two side by side (given: {len(options.controllers)})")
+    if options.speed is not None and not SPEEDS[0] <= options.speed <= 1000:
+        raise SettingsError(f"speed: {options.speed} is impossible; it must be from {SPEEDS[0]} to 1000")
+    checked(options.rewards)
+    checked_size(options.size)
+    if options.size[0] * len(options.controllers) > MAX_SIZE:
+        raise SettingsError(f"size: two pictures side by side are at most {MAX_SIZE} wide (given: {options.size})")
+    for name in ("steps", "fps"):
+        if name in given and options.out is None:
+            raise SettingsError(f"--{name}: is of a film; give --out FILE.mp4 or FILE.gif, too")
+    return options
+
+
+def live(options: Watch) -> list[Source]:
+    """Episodes to be played, one a controller, on the same seeds.
+
+    Raises:
+        SettingsError: a name is unknown, or a world cannot be made.
+        ControllerError: an object given as controller is none.
+    """
+    lists = {
+        name: () if value is None else (value,)
+        for name, value in ((name, getattr(options, name)) for name in ("flocks", "cohesion", "shepherds"))
+    }
+    sources: list[Source] = []
+    for name in options.controllers:  # the same one twice is fine: one of them can be led
+        (point,) = points(
+            controllers=[name],
+            scenario=options.scenario,
+            sheep=options.sheep,
+            body=options.body,
+            flock=options.flock,
+            **lists,
+        )
+        sources.append(Live(point, options.seed, options.trial, options.rewards))
+    return sources
+
+
+def make_player(sources: Sequence[Source], options: Watch) -> Player:
+    """The player of these sources.
+
+    Raises:
+        SettingsError: no world can be placed.
+    """
+    w, h = options.size
+    return Player(
+        sources,
+        (w * len(sources), h),
+        theme="dark" if options.dark else "light",
+        speed=options.speed or (1.0 if options.out is None else 8.0),
+        beams="all" if options.beams else "none",
+        camera=options.camera,
+        keys=options.out is None,
+    )
+
+
+def run(player: Player, window: Window) -> None:
+    """Show a player in a window until its user has enough."""
+    try:
+        window.wait(WINDOW_FPS)
+        while player.running:
+            for event in window.events():
+                player.handle(event)
+            player.tick(window.wait(WINDOW_FPS))
+            player.size = window.size
+            window.show(player.canvas())
+    finally:
+        window.close()
+
+
+def film(player: Player, options: Watch) -> Iterator[NDArray[np.uint8]]:
+    """The pictures of a film, from the first state to the last step asked for, or the last there is."""
+    yield player.canvas().picture()
+    views: list[Any] = player.views
+    while not player.over and (options.steps is None or max(view.now.state.step for view in views) < options.steps):
+        player.tick(1.0 / options.fps)
+        yield player.canvas().picture()

@@ -1,0 +1,205 @@
+"""``shepherd-phys watch`` as a command, its films, and the env's own window and Gymnasium's films."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import imageio_ffmpeg
+import numpy as np
+import pytest
+from PIL import Image, ImageSequence
+
+from shepherd_phys.canvas import pygame_ce
+from shepherd_phys.envs import ShepherdingEnv
+from shepherd_phys.film import write_film
+from shepherd_phys.scripts import watch
+from shepherd_phys.scripts.main import main
+from shepherd_phys.settings import SettingsError
+
+HEADLESS = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")}
+
+
+def command(tmp_path, *words):
+    return subprocess.run(
+        [str(Path(sys.executable).parent / "shepherd-phys"), "watch", *words],
+        cwd=tmp_path,
+        env=HEADLESS,
+        capture_output=True,
+        text=True,
+        timeout=280,
+        check=False,
+    )
+
+
+def frames_of(path):
+    """The pictures of a film, uint8 (K, h, w, 3), and how many of them a second."""
+    if path.suffix.lower() == ".gif":
+        with Image.open(path) as film:
+            pictures = np.stack([np.array(frame.convert("RGB")) for frame in ImageSequence.Iterator(film)])
+            return pictures, 1000 / film.info["duration"]
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", str(path), "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    done = subprocess.run(command, capture_output=True, check=True)
+    w, h, fps = re.search(r"yuv420p.* (\d+)x(\d+)\W.* ([\d.]+) fps", done.stderr.decode()).groups()
+    return np.frombuffer(done.stdout, np.uint8).reshape(-1, int(h), int(w), 3), float(fps)
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "shape"),
+    [
+        ("film.mp4", ["--controllers", "strombom"], (120, 160)),
+        ("film.GIF", ["--controllers", "strombom", "idle", "--dark", "--beams", "--camera", "follow"], (120, 320)),
+    ],
+)
+def test_films(tmp_path, name, words, shape):
+    small = ["--scenario", "small", "--size", "160", "120", "--steps", "8", "--speed", "2", "--fps", "10"]
+    done = command(tmp_path, *words, *small, "--out", name)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == f"{name}  (9 pictures)\n"  # 8 steps of 0.2 s at twice the speed and 10 fps, and the start
+    assert os.listdir(tmp_path) == [name]
+    frames, fps = frames_of(tmp_path / name)
+    assert frames.shape[1:3] == shape and len(frames) >= 5  # a GIF leaves out pictures that repeat the last one
+    assert all(frame.std() > 3 for frame in frames)
+    assert (frames[0] != frames[-1]).any()
+    assert fps == pytest.approx(10)
+
+
+def test_odd_sizes_make_films_that_play(tmp_path):
+    pictures = [np.full((41, 63, 3), 20 * k, np.uint8) for k in range(5)]
+    assert write_film(pictures, tmp_path / "a.mp4", 10) == 5
+    frames, _ = frames_of(tmp_path / "a.mp4")
+    assert frames.shape == (5, 40, 62, 3)
+    np.testing.assert_allclose(frames.mean(axis=(1, 2, 3)), [0, 20, 40, 60, 80], atol=3)
+    assert write_film(pictures, tmp_path / "a.gif", 10) == 5
+    np.testing.assert_allclose(frames_of(tmp_path / "a.gif")[0].mean(axis=(1, 2, 3)), [0, 20, 40, 60, 80], atol=3)
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.gif"])
+def test_a_film_is_whole_or_not_there(tmp_path, name):
+    def broken():
+        yield np.zeros((40, 40, 3), np.uint8)
+        raise RuntimeError("no more")
+
+    path = tmp_path / name
+    path.write_bytes(b"old")
+    with pytest.raises(RuntimeError, match="no more"):
+        write_film(broken(), path, 10)
+    assert path.read_bytes() == b"old" and os.listdir(tmp_path) == [name]
+    with pytest.raises(ValueError, match="at least one picture"):
+        write_film([], path, 10)
+
+
+def test_without_moviepy(monkeypatch, capsys, tmp_path):
+    monkeypatch.setitem(sys.modules, "moviepy.video.io", None)
+    assert main(["watch", "--out", str(tmp_path / "a.mp4")]) == 2
+    assert capsys.readouterr().err == 'shepherd-phys watch: films need moviepy: pip install "shepherd-phys[film]"\n'
+
+
+def test_without_pygame(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    pygame_ce.cache_clear()
+    assert main(["watch"]) == 2
+    assert 'pip install "shepherd-phys[render]"' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--out", "film.avi"], "film.avi: a film ends in .mp4 or .gif (given: '.avi')"),
+        (["--out", "film"], "(given: 'no ending')"),
+        (["--out", "nowhere/film.mp4"], "no such folder"),
+        (["--out", "film.gif", "--fps", "200"], "fps: must be from 1 to 50"),
+        (["--controllers", "wolf"], "controllers: 'wolf' is unknown"),
+        (["--controllers", "a", "b", "c"], "controllers: one or two side by side (given: 3)"),
+        (["--controllers", "none.json"], "none.json"),
+        (["--scenario", "moon"], "scenario: 'moon'"),
+        (["--rewards", "wool"], "rewards: 'wool' is not one of"),
+        (["--speed", "0"], "speed: 0.0 is impossible"),
+        (["--size", "3", "3"], "size: must be"),
+        (["--size", "8000", "99", "--controllers", "idle", "idle"], "size: two pictures"),
+        (["--flocks", "0"], "flocks: 0 is impossible"),
+        (["--steps", "5"], "--steps: is of a film"),
+        (["--camera", "near"], "--camera"),
+        ([], "no display for a window (neither DISPLAY nor WAYLAND_DISPLAY is set)"),
+    ],
+)
+def test_bad_input_is_one_line(words, message, monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    for name in ("SDL_VIDEODRIVER", "SDL_VIDEO_DRIVER", "DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    assert main(["watch", *words]) == 2
+    said = capsys.readouterr()
+    assert said.out == "" and said.err.count("\n") == 1
+    assert said.err.startswith("shepherd-phys watch: ") and message in said.err
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_controller_that_fails_leaves_no_film(tmp_path):
+    (tmp_path / "mine.py").write_text(
+        "import numpy as np\nclass Bad:\n    lidar = None\n    def reset(self, rng): ...\n"
+        "    def act(self, observation, state): return np.full((3, 2), np.nan)\n"
+    )
+    done = command(tmp_path, "--controllers", "mine:Bad", "--out", "film.mp4")
+    assert done.returncode == 1
+    assert "NaN" in done.stderr and done.stderr.count("\n") == 1
+    assert not list(tmp_path.glob("film*"))
+
+
+def test_options_reach_the_player():
+    words = ["--controllers", "idle", "--scenario", "small", "--flocks", "1", "--shepherds", "3", "--body", "Flyer"]
+    options = watch.read_options([*words, "--sheep", "9", "--dark", "--beams", "--speed", "4", "--trial", "2"])
+    player = watch.make_player(watch.live(options), options)
+    scenario = player.views[0].source.scenario
+    assert (scenario.n_flocks, scenario.n_shepherds, scenario.n_sheep) == (1, 3, 9)
+    assert type(scenario.shepherds[0]).__name__ == "Flyer"
+    assert (player.theme, player.beams, player.speed) == ("dark", "all", 4.0)
+    assert player.views[0].source.label == "trial 2 of seed 20000"
+
+
+def test_the_window_of_the_env(monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    env = gym.make("shepherd_phys.envs:Shepherding-v0", scenario="small", render_mode="human", render_size=(120, 90))
+    world = env.unwrapped
+    world.metadata = {**world.metadata, "render_fps": 1000}
+    pygame = pygame_ce()
+    env.reset(seed=0)
+    first = pygame.surfarray.array3d(pygame.display.get_surface())
+    assert first.shape == (120, 90, 3) and first.std() > 3
+    for _ in range(5):
+        env.step(np.ones((2, 2), np.float32))
+        assert env.render() is None
+    assert (pygame.surfarray.array3d(pygame.display.get_surface()) != first).any()
+    pygame.event.post(pygame.event.Event(pygame.QUIT))
+    env.step(np.ones((2, 2), np.float32))
+    assert not pygame.display.get_init()
+    env.step(np.ones((2, 2), np.float32))  # the episode goes on
+    assert not pygame.display.get_init()
+    env.close()
+
+
+def test_films_of_gymnasium(tmp_path):
+    env = gym.make("shepherd_phys.envs:Shepherding-v0", scenario="small", render_mode="rgb_array", render_size=(96, 64))
+    film = gym.wrappers.RecordVideo(env, str(tmp_path / "films"), episode_trigger=lambda _: True, disable_logger=True)
+    film.reset(seed=0)
+    for _ in range(6):
+        film.step(np.ones((2, 2), np.float32))
+    film.close()
+    (path,) = (tmp_path / "films").glob("*.mp4")
+    frames, fps = frames_of(path)
+    assert frames.shape[1:] == (64, 96, 3) and len(frames) >= 6 and all(frame.std() > 3 for frame in frames)
+    assert fps == 5  # as fast as the world
+
+
+def test_looks_of_the_env():
+    def picture(**options):
+        env = ShepherdingEnv("small", render_mode="rgb_array", render_size=(200, 160), **options)
+        env.reset(seed=0)
+        return env.render()
+
+    light = picture()
+    assert picture(render_theme="dark").mean() < 80 < light.mean()
+    assert (picture(render_beams=True) != light).any()
+    with pytest.raises(SettingsError, match="render_theme: 'pink' is not one of light, dark"):
+        picture(render_theme="pink")
