@@ -15,6 +15,7 @@ from shepherd_phys.lidar import Scan
 from shepherd_phys.overlays import draw_note, draw_table
 from shepherd_phys.palette import THEMES
 from shepherd_phys.render import paint
+from shepherd_phys.replay import detection_radius
 from shepherd_phys.state import Floats, WorldState, frozen
 
 from .sources import Frame, Source, between
@@ -312,14 +313,13 @@ class Player:
         for k, (view, state, camera) in enumerate(zip(self.views, self._states(), self._cameras(), strict=True)):
             chosen = self.chosen[1] if self.chosen is not None and self.chosen[0] == k else None
             scan, earning = self._beams(view.now, chosen)
-            flock = view.source.scenario.flock
             part = paint(
                 state,
                 self._part,
                 camera=camera,
                 scenario=view.source.scenario,
                 trails=list(view.trails),
-                influence_radius=(getattr(flock, "detection_radius", None) or None) if self.influence else None,
+                influence_radius=(detection_radius(view.source.scenario.flock) or None) if self.influence else None,
                 start=view.start,
                 scan=scan,
                 earning=earning,

@@ -1,9 +1,10 @@
-"""Where the pictures of ``watch`` come from: a `Source` of frames, and `Live`, an episode that is being played."""
+"""Where the pictures of ``watch`` come from: `Live`, an episode being played, or `Recorded`, one from a file."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -13,6 +14,7 @@ from shepherd_phys.controllers.evaluation import checked_action, trial_seed
 from shepherd_phys.envs.rewards import SCHEMES, earning_beams
 from shepherd_phys.envs.shepherding import ShepherdingEnv
 from shepherd_phys.lidar import Lidar, Scan
+from shepherd_phys.replay import Replay
 from shepherd_phys.scenario import Scenario
 from shepherd_phys.state import Floats, WorldState, unit
 
@@ -123,6 +125,38 @@ class Live:
     def _frame(self, *, over: bool) -> Frame:
         scan = self.env.scan
         return Frame(self.env.state, over, scan, earning_beams(self._scheme, scan), dict(self._sums))
+
+
+class Recorded:
+    """An episode from a file, as it was. There are no scans in it: no beams are to be seen, and nobody can interfere.
+
+    Args:
+        replay: the episode.
+    """
+
+    steerable = False
+
+    def __init__(self, replay: Replay) -> None:
+        self.replay = replay
+        self.scenario = replay.scenario
+        self.name = Path(replay.controller).stem
+        self.label = f"seed {replay.seed}"
+        # what each term has given until a state: 0 at first
+        self._sums = {name: np.concatenate([[0.0], np.cumsum(values)]) for name, values in replay.rewards.items()}
+
+    def restart(self, *, onward: bool = False) -> Frame:
+        """The first frame; there is no other episode to go onward to."""
+        self._step = 0
+        return self._frame()
+
+    def advance(self, taken: Mapping[int, Floats]) -> Frame:
+        """The next state."""
+        self._step += 1
+        return self._frame()
+
+    def _frame(self) -> Frame:
+        rewards = {name: float(values[self._step]) for name, values in self._sums.items()}
+        return Frame(self.replay[self._step], self._step >= self.replay.n_steps, rewards=rewards)
 
 
 def between(before: WorldState, after: WorldState, share: float) -> WorldState:

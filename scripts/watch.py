@@ -1,4 +1,4 @@
-"""``shepherd-phys watch``: controllers at work, in a window or on film."""
+"""``shepherd-phys watch``: controllers at work, or replays, in a window, on film or as a page."""
 
 from __future__ import annotations
 
@@ -18,13 +18,15 @@ from shepherd_phys.canvas import pygame_ce
 from shepherd_phys.controllers.evaluation import ControllerError
 from shepherd_phys.envs.rewards import checked
 from shepherd_phys.film import checked_film, write_film
+from shepherd_phys.replay import Replay
+from shepherd_phys.replay_file import load_replay
 from shepherd_phys.settings import SettingsError
 from shepherd_phys.window import DisplayError, Window
 
 from .command import at_least, fail, flag, parsed
 from .player import SPEEDS, Player
 from .points import points
-from .sources import Live, Source
+from .sources import Live, Recorded, Source
 
 PROG = "shepherd-phys watch"
 WINDOW_FPS = 30
@@ -36,7 +38,7 @@ class Watch:
     """Watch controllers at work, live in a window, or write a film of them; H in the window shows the keys.
 
     Episodes are those of evaluate: trial 0 of --seed first. In the window, arrow keys, W A S D or the mouse take a
-    shepherd over; G gives it back.
+    shepherd over; G gives it back. --replay plays files that evaluate --save-replay left, and makes pages of them.
     """
 
     controllers: Annotated[tuple[str, ...], flag("A [B]")] = ("collie",)
@@ -61,8 +63,10 @@ class Watch:
     """The first episode: trial I of the root seed."""
     rewards: Annotated[str, flag("NAME")] = "wild"
     """The scheme whose terms the panel tells, and whose beams are drawn strongest: original, any or wild."""
-    out: Annotated[Path | None, flag("FILE.mp4|FILE.gif", "a window")] = None
-    """Write a film instead of opening a window; it needs no display."""
+    replay: Annotated[tuple[Path, ...], flag("FILE [FILE]", "")] = ()
+    """Play an episode from a file instead, or two side by side; what is of playing one anew does not go with it."""
+    out: Annotated[Path | None, flag("FILE.mp4|FILE.gif|FILE.html", "a window")] = None
+    """Write a film instead of opening a window; it needs no display. A replay can become a page, FILE.html, too."""
     steps: Annotated[int | None, flag("N", "the whole episode")] = None
     """Control steps of a film."""
     speed: Annotated[float | None, flag("X", "1; 8 in a film")] = None
@@ -79,6 +83,12 @@ class Watch:
     """Dark colours."""
 
 
+OF_LIVE = ("controllers", "scenario", "flocks", "cohesion", "shepherds", "sheep", "body", "flock", "seed", "trial",
+           "rewards", "beams")  # fmt: skip
+"""What a replay has settled."""
+PAGE = ".html"
+OF_PICTURES = ("steps", "speed", "fps", "size", "camera", "dark")
+"""What a page has not."""
 LEAST = {"flocks": 1, "cohesion": 1, "shepherds": 0, "sheep": 1, "seed": 0, "trial": 0, "steps": 1, "fps": 1}
 
 
@@ -86,6 +96,9 @@ def main(argv: Sequence[str]) -> int:
     """Run the command; the exit status: 0, 1 if something failed, 2 for a mistake of the user, 130 for Ctrl-C."""
     try:
         options = read_options(argv)
+        replays = [load_replay(path) for path in options.replay]
+        if options.out is not None and options.out.suffix.lower() == PAGE:
+            return write_pages(replays, options.out)
         pygame_ce()
         if options.out is not None:
             checked_film(options.out, options.fps)
@@ -93,7 +106,7 @@ def main(argv: Sequence[str]) -> int:
         return fail(PROG, error, 2)
     with contextlib.redirect_stdout(sys.stderr):  # a user's classes may print wherever they are touched
         try:
-            sources = live(options)
+            sources: list[Source] = [Recorded(replay) for replay in replays] or live(options)
             player = make_player(sources, options)
         except (SettingsError, ControllerError) as error:
             return fail(PROG, error, 2)
@@ -126,12 +139,33 @@ def read_options(argv: Sequence[str]) -> Watch:
         raise SettingsError(f"speed: {options.speed} is impossible; it must be from {SPEEDS[0]} to 1000")
     checked(options.rewards)
     checked_size(options.size)
-    if options.size[0] * len(options.controllers) > MAX_SIZE:
+    if options.size[0] * len(options.replay or options.controllers) > MAX_SIZE:
         raise SettingsError(f"size: two pictures side by side are at most {MAX_SIZE} wide (given: {options.size})")
+    if len(options.replay) > MAX_VIEWS or ("replay" in given and not options.replay):
+        raise SettingsError(f"--replay: one or two side by side (given: {len(options.replay)})")
+    is_page = options.out is not None and options.out.suffix.lower() == PAGE
+    if is_page and len(options.replay) != 1:
+        raise SettingsError(f"--out: a page is made of one replay, given by --replay (given: {len(options.replay)})")
+    for name in (*(OF_LIVE if options.replay else ()), *(OF_PICTURES if is_page else ())):
+        if name in given:
+            raise SettingsError(f"--{name}: does not go with {f'--out {options.out}' if is_page else '--replay'}")
     for name in ("steps", "fps"):
         if name in given and options.out is None:
             raise SettingsError(f"--{name}: is of a film; give --out FILE.mp4 or FILE.gif, too")
     return options
+
+
+def write_pages(replays: Sequence[Replay], path: Path) -> int:
+    """Make a page of the one replay; the exit status.
+
+    Raises:
+        ReplayError: bokeh is missing, or the file cannot be written.
+    """
+    from .replay_page import write_page  # only now: bokeh takes a while to load
+
+    write_page(replays[0], path)
+    print(path)
+    return 0
 
 
 def live(options: Watch) -> list[Source]:

@@ -13,10 +13,18 @@ import pytest
 from PIL import Image, ImageSequence
 
 from shepherd_phys.canvas import pygame_ce
+from shepherd_phys.controllers import StrombomTeam
+from shepherd_phys.controllers.recording import record
 from shepherd_phys.envs import ShepherdingEnv
 from shepherd_phys.film import write_film
+from shepherd_phys.layouts import Scattered
+from shepherd_phys.replay_file import load_replay, save_replay
+from shepherd_phys.scenario import load_scenario
 from shepherd_phys.scripts import watch
 from shepherd_phys.scripts.main import main
+from shepherd_phys.scripts.player import Player
+from shepherd_phys.scripts.replay_page import page
+from shepherd_phys.scripts.sources import Recorded
 from shepherd_phys.settings import SettingsError
 
 HEADLESS = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")}
@@ -121,6 +129,11 @@ def test_without_pygame(monkeypatch, capsys):
         (["--size", "8000", "99", "--controllers", "idle", "idle"], "size: two pictures"),
         (["--flocks", "0"], "flocks: 0 is impossible"),
         (["--steps", "5"], "--steps: is of a film"),
+        (["--replay", "none.npz"], "none.npz"),
+        (["--replay", "a.npz", "--seed", "5"], "--seed: does not go with --replay"),
+        (["--replay", "a.npz", "b.npz", "c.npz"], "--replay: one or two side by side (given: 3)"),
+        (["--out", "a.html"], "--out: a page is made of one replay, given by --replay (given: 0)"),
+        (["--replay", "a.npz", "--out", "a.html", "--dark"], "--dark: does not go with --out a.html"),
         (["--camera", "near"], "--camera"),
         ([], "no display for a window (neither DISPLAY nor WAYLAND_DISPLAY is set)"),
     ],
@@ -203,3 +216,45 @@ def test_looks_of_the_env():
     assert (picture(render_beams=True) != light).any()
     with pytest.raises(SettingsError, match="render_theme: 'pink' is not one of light, dark"):
         picture(render_theme="pink")
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory):
+    """A short episode in a file."""
+    path = tmp_path_factory.mktemp("replay") / "episode.npz"
+    scenario = load_scenario("small").but(n_steps=6, layout=Scattered(count=2))
+    save_replay(record(StrombomTeam(), ShepherdingEnv(scenario, rewards="wild"), seed=7), path)
+    return path
+
+
+def test_a_replay_is_a_source_of_the_states_that_were(kept):
+    replay = load_replay(kept)
+    source = Recorded(replay)
+    frame, told = source.restart(), []
+    while not frame.over:
+        told.append(frame)
+        frame = source.advance({0: np.array([1.0, 0.0])})  # nobody heeds that
+    assert [one.state.step for one in [*told, frame]] == list(range(7))
+    np.testing.assert_array_equal(frame.state.sheep_pos, replay[-1].sheep_pos)
+    assert set(told[0].rewards.values()) == {0.0}
+    assert frame.rewards == {name: pytest.approx(values.sum()) for name, values in replay.rewards.items()}
+    assert source.restart(onward=True).state.step == 0
+    player = Player([Recorded(replay), Recorded(replay)], (320, 160))
+    first = player.canvas().picture()
+    player.tick(1.0)
+    assert (player.canvas().picture() != first).any()
+
+
+def test_films_and_pages_of_a_replay(kept, tmp_path):
+    done = command(
+        tmp_path, "--replay", str(kept), str(kept), "--out", "two.gif", "--size", "120", "90", "--speed", "2"
+    )
+    assert done.returncode == 0 and done.stdout.startswith("two.gif  ("), done.stderr
+    assert frames_of(tmp_path / "two.gif")[0].shape[1:] == (90, 240, 3)
+    done = command(tmp_path, "--replay", str(kept), "--out", "page.html")
+    assert (done.returncode, done.stdout) == (0, "page.html\n"), done.stderr
+    assert (tmp_path / "page.html").read_text("utf-8") == page(load_replay(kept))
+    (tmp_path / "broken.npz").write_bytes(kept.read_bytes()[:500])
+    done = command(tmp_path, "--replay", "broken.npz", "--out", "other.html")
+    assert done.returncode == 2 and done.stderr.count("\n") == 1 and "broken.npz" in done.stderr
+    assert not (tmp_path / "other.html").exists()
