@@ -109,7 +109,7 @@ class Replay:
     @property
     def in_goal(self) -> NDArray[np.int64]:
         """(T + 1,) sheep in the goal."""
-        return np.count_nonzero(self.states["sheep_in_goal"], axis=1)
+        return np.asarray(np.count_nonzero(self.states["sheep_in_goal"], axis=1), dtype=np.int64)
 
     @property
     def success(self) -> bool:

@@ -73,7 +73,7 @@ def test_each_episode_leaves_a_file_that_a_resumed_campaign_completes(folder):
 
 def test_a_folder_that_cannot_be_is_told_before_anything_runs(folder, capsys):
     (folder / "file").write_text("")
-    assert evaluate.main([*GRID, "--trials", "1", "--workers", "0", "--out", "out", "--save-replay", "file"]) == 2
+    assert evaluate.main([*GRID, "--trials", "1", "--workers", "1", "--out", "out", "--save-replay", "file"]) == 2
     said = capsys.readouterr().err
     assert len(said.splitlines()) == 1 and "save-replay: file: cannot be made" in said
     assert not Path("out").exists()
