@@ -82,8 +82,8 @@ def draw_trajectories(point: Point, seed: int, walk: Walks, coloring: Coloring, 
             color, path = LOOK.shepherds[p % len(LOOK.shepherds)], walk.shepherds[:, p]
             axes.plot(*path.T, color="white", linewidth=2.6, alpha=0.6, zorder=5)
             axes.plot(*path.T, color=color, linewidth=1.2, zorder=6)
-            axes.scatter(*path[0], s=55, facecolors="white", edgecolors=color, linewidths=1.6, zorder=7)
-            axes.scatter(*path[-1], s=55, color=color, edgecolors="white", linewidths=0.8, zorder=8)
+            _dots(axes, path[0], s=55, facecolors="white", edgecolors=color, linewidths=1.6, zorder=7)
+            _dots(axes, path[-1], s=55, color=color, edgecolors="white", linewidths=0.8, zorder=8)
             handles.append(Line2D([], [], color=color, linewidth=1.6, label=f"shepherd {p + 1}"))
         if coloring == "flock":
             handles += [
