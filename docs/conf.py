@@ -46,6 +46,7 @@ RULE = re.compile(r"\|[-:| ]+\|")
 def setup(app: Sphinx) -> None:
     """What autodoc and Sphinx do not do of themselves."""
     app.connect("autodoc-process-docstring", read_docstring)
+    app.connect("autodoc-process-signature", leave_out_protocols)
     app.connect("doctree-read", leave_out_long_values)
     app.connect("missing-reference", find_by_last_name)
 
@@ -86,6 +87,13 @@ def escaped(lines: Iterable[str]) -> Iterable[str]:
     for line in lines:
         parts = LITERAL.split(line)
         yield "".join(part if k % 2 else part.replace("|", r"\|") for k, part in enumerate(parts))
+
+
+def leave_out_protocols(
+    app: Sphinx, what: str, name: str, thing: Any, options: Any, signature: str | None, answer: str | None
+) -> tuple[str | None, str | None]:
+    """Nobody calls a protocol."""
+    return ("" if getattr(thing, "_is_protocol", False) else signature), answer
 
 
 def leave_out_long_values(app: Sphinx, tree: nodes.document) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import pymunk
@@ -67,17 +67,23 @@ def draw_trajectories(point: Point, seed: int, walk: Walks, coloring: Coloring, 
                 own = [walk.sheep[:, i] for i in np.flatnonzero(flocks == k)]
                 color = FLOCKS[k % len(FLOCKS)]
                 axes.add_collection(LineCollection(own, colors=color, linewidths=0.5, alpha=0.45, zorder=3))
-                axes.scatter(
-                    *walk.sheep[0, flocks == k].T, s=7, facecolors="white", edgecolors=color, linewidths=0.6, zorder=4
+                _dots(
+                    axes,
+                    walk.sheep[0, flocks == k],
+                    s=7,
+                    facecolors="white",
+                    edgecolors=color,
+                    linewidths=0.6,
+                    zorder=4,
                 )
-                axes.scatter(*walk.sheep[-1, flocks == k].T, s=7, color=color, linewidths=0.0, zorder=4)
+                _dots(axes, walk.sheep[-1, flocks == k], s=7, color=color, linewidths=0.0, zorder=4)
         handles = [_mark("white", LOOK.ink, "start"), _mark(LOOK.ink, LOOK.ink, "end")]
         for p in range(walk.start.n_shepherds):
             color, path = LOOK.shepherds[p % len(LOOK.shepherds)], walk.shepherds[:, p]
             axes.plot(*path.T, color="white", linewidth=2.6, alpha=0.6, zorder=5)
             axes.plot(*path.T, color=color, linewidth=1.2, zorder=6)
-            axes.scatter(*path[0], s=55, facecolors="white", edgecolors=color, linewidths=1.6, zorder=7)
-            axes.scatter(*path[-1], s=55, color=color, edgecolors="white", linewidths=0.8, zorder=8)
+            _dots(axes, path[0], s=55, facecolors="white", edgecolors=color, linewidths=1.6, zorder=7)
+            _dots(axes, path[-1], s=55, color=color, edgecolors="white", linewidths=0.8, zorder=8)
             handles.append(Line2D([], [], color=color, linewidth=1.6, label=f"shepherd {p + 1}"))
         if coloring == "flock":
             handles += [
@@ -117,7 +123,7 @@ def draw_maps(found: Sequence[Map], who: Who, frame: Frame, about: str, goal_rad
         for axes in grid.ravel()[len(found) :]:
             axes.set_visible(False)
         for k, (axes, one) in enumerate(zip(grid.ravel(), found, strict=False)):
-            shown = np.ma.masked_less(one.seconds, norm.vmin)
+            shown = np.ma.masked_equal(one.seconds, 0.0)
             image = axes.imshow(
                 shown,
                 origin="lower",
@@ -176,11 +182,17 @@ def _by_time(axes: Axes, walk: Walks) -> None:
     lines = LineCollection(pieces, array=times, cmap=TIME, norm=norm, linewidths=0.6, alpha=0.6, zorder=3)
     lines.set_rasterized(True)
     axes.add_collection(lines)
-    axes.scatter(*walk.sheep[0].T, s=8, facecolors="white", edgecolors=TIME(0.15), linewidths=0.6, zorder=4)
-    axes.scatter(*walk.sheep[-1].T, s=8, color=TIME(1.0), linewidths=0.0, zorder=4)
+    _dots(axes, walk.sheep[0], s=8, facecolors="white", edgecolors=TIME(0.15), linewidths=0.6, zorder=4)
+    _dots(axes, walk.sheep[-1], s=8, color=TIME(1.0), linewidths=0.0, zorder=4)
     scale = axes.figure.colorbar(ScalarMappable(norm, TIME), ax=axes, shrink=0.7, aspect=30, pad=0.02)
     scale.set_label("sheep: time, s", fontsize=9)
     scale.ax.tick_params(labelsize=9)
+
+
+def _dots(axes: Axes, places: Floats, **look: Any) -> None:
+    """Discs at (K, 2) or one at (2,)."""
+    x, y = np.atleast_2d(places).T
+    axes.scatter(x, y, **look)
 
 
 def _mark(face: str, edge: str, label: str) -> Line2D:

@@ -350,11 +350,11 @@ def draw_learning(options: Learning) -> bytes:
             validations += [{**labels, **row} for row in read_rows(run / VALIDATION, columns)]
     if options.validation and not validations:
         raise SettingsError("validation: none of the runs has been validated")
-    validated = options.validation or (("in_goal_end",) if validations else ())
+    checked = options.validation or (("in_goal_end",) if validations else ())
     if not curves:
         raise SettingsError("the runs have not ended a rollout yet")
-    named = ({name: TITLES[name] for name in measures} for measures in (options.training, validated))
-    return learning_figures.draw_runs(curves, validations, *named, kind_of_file(options.out))
+    trained, validated = ({name: TITLES[name] for name in measures} for measures in (options.training, checked))
+    return learning_figures.draw_runs(curves, validations, trained, validated, kind_of_file(options.out))
 
 
 def recipes(runs: Sequence[Path]) -> list[tuple[str, Path]]:
