@@ -19,6 +19,8 @@ from .network import Actor
 from .policy_files import PolicySpec, read_policy
 
 SHIPPED = Path(__file__).parent / "policies"
+MIRRORED = np.array([1.0, -1.0], np.float32)
+"""An action's two numbers, along the way to the goal and across, as a mirror shows them."""
 
 
 class Policy:
@@ -51,6 +53,7 @@ class Policy:
         self._directions = beam_directions(spec.lidar.beams)
         self._offset: NDArray[np.int64] | None = None
         self._action: NDArray[np.float64] | None = None
+        self._mirrored: NDArray[np.bool_] | None = None
         self._rng = np.random.default_rng(0)
         self._chance = np.zeros((0, 2))
 
@@ -67,7 +70,7 @@ class Policy:
 
     def reset(self, rng: np.random.Generator) -> None:
         """Forget the last episode."""
-        self._offset = self._action = None
+        self._offset = self._action = self._mirrored = None
         self._rng = rng
 
     def act(self, observation: NDArray[np.float32], state: WorldState) -> NDArray[np.float64]:
@@ -88,10 +91,29 @@ class Policy:
         if acting.noise and (self._action is None or state.step % acting.noise_steps == 0):
             self._chance = acting.noise * self._rng.standard_normal((n, 2))
         if self._action is None or state.step % self._interval == 0:
+            if acting.mirror != "never":
+                observation = self._in_mirror(observation)
             mean, deviation = self._actor(observation)
             action = mean + self._chance * deviation if acting.noise else mean
+            if self._mirrored is not None:
+                action = np.where(self._mirrored[:, None], action * MIRRORED, action)
             self._action = _wanted(action, self._offset, self._directions, acting.rest)
         return self._action.copy()
+
+    def _in_mirror(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The observations (P, R, C), of mirrored shepherds with columns the other way round, and who they are.
+
+        Sector 0 stays where it is: it is half a beam off its own mirror image.
+        """
+        columns = observation.shape[2]
+        if self._mirrored is None:
+            channels = self.spec.lidar.channels
+            sheep = observation[:, len(channels) * (self.spec.lidar.stack - 1) + channels.index("sheep")]
+            nearest = sheep.argmax(axis=1)  # 0, straight ahead, where none is seen
+            left = (nearest > 0) & (2 * nearest < columns)
+            right = 2 * nearest > columns
+            self._mirrored = left if self.spec.action.mirror == "left" else right
+        return np.where(self._mirrored[:, None, None], observation[:, :, -np.arange(columns)], observation)
 
     def to_dict(self) -> dict[str, Any]:
         """What identifies it in results."""

@@ -225,6 +225,42 @@ def test_less_than_the_least_speed_is_standing_still():
     assert 0 < np.count_nonzero(rests[:, 0] == 0.0) < 40
 
 
+def test_who_has_the_nearest_sheep_on_that_side_sees_the_world_in_a_mirror():
+    lidar = Lidar(beams=64, stack=2, frame="goal")
+    weights = random_weights(SMALL, lidar)
+    seen = np.random.default_rng(0).random((4, 6, 64), dtype=np.float32) * 0.5
+    seen[:, 2::3] = 0.0
+    seen[:, 2::3, 0] = 0.5  # the goal, straight ahead
+    for shepherd, beam in enumerate((9, 55, 0, 32)):  # nearest sheep: left, right, ahead, behind
+        seen[shepherd, 3, beam] = 0.9
+    seen[:, 0, 20] = 0.99  # what was nearest a step ago does not count
+    mirrored = seen[:, :, -np.arange(64)]
+
+    def acts(mirror, *observations):
+        policy = Policy(spec_of(lidar, mirror=mirror), weights)
+        return [policy.act(observation, STATE) for observation in observations]
+
+    (plain,), (other,) = acts("never", seen), acts("never", mirrored)
+    (left,), (right,) = acts("left", seen), acts("right", seen)
+    np.testing.assert_allclose(left, [other[0] * (1, -1), plain[1], plain[2], plain[3]], atol=1e-6)
+    np.testing.assert_allclose(right, [plain[0], other[1] * (1, -1), plain[2], plain[3]], atol=1e-6)
+    assert not np.allclose(left[0], plain[0]) and not np.allclose(right[1], plain[1])
+    # it stays so for the episode, wherever the nearest sheep is later
+    _, later = acts("left", seen, mirrored)
+    np.testing.assert_allclose(later, [plain[0] * (1, -1), *other[1:]], atol=1e-6)
+    # and the next episode begins without it
+    policy = Policy(spec_of(lidar, mirror="left"), weights)
+    policy.act(mirrored, STATE)
+    policy.reset(np.random.default_rng(0))
+    np.testing.assert_allclose(policy.act(seen, STATE), left, atol=1e-6)
+
+
+@pytest.mark.parametrize("lidar", [Lidar(), Lidar(frame="goal", channels=("goal",))])
+def test_a_mirror_needs_the_goal_ahead_and_sheep_to_see(lidar):
+    with pytest.raises(PolicyError, match=r"action.mirror: needs the frame 'goal' and the channel of sheep"):
+        spec_of(lidar, mirror="left")
+
+
 def test_each_shepherd_acts_alone():
     """Whoever else is in the team: the same observation, the same action."""
     policy = Policy(spec_of(), random_weights(SMALL, LIDAR))

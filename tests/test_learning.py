@@ -371,7 +371,8 @@ def test_a_preset_may_mix_worlds_and_price_effort():
     spec = spec_of_preset(TINY.but(rest=0.25, noise=0.5))
     assert spec.action == Acting(frame="goal", rest=0.25, noise=0.5, noise_steps=TINY.decision_interval)
     assert spec_of_preset(TINY.but(noise=0.0)).action == Acting(frame="goal", noise_steps=TINY.decision_interval)
-    assert not {"rest", "noise"} & set(spec.training)
+    assert spec_of_preset(TINY.but(mirror="left")).action.mirror == "left"
+    assert not {"rest", "noise", "mirror"} & set(spec.training)
     far = TINY.but(flock_distance=(4.0, 5.0), uneven=1.0).draw()(np.random.default_rng(0), 0)
     assert far.flock_distance == (4.0, 5.0) and far.flock_sizes is not None and far.n_flocks == TINY.scenario.n_flocks
     assert TINY.but(flock_distance=(4.0, 5.0)).draw() == TINY.scenario.but(flock_distance=(4.0, 5.0))

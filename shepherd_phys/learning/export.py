@@ -24,7 +24,8 @@ from shepherd_phys.settings import tagged
 def spec_of(preset: Preset, shepherd_steps: int = 0) -> PolicySpec:
     """What the file of a policy trained by ``preset`` says beside its weights."""
     training = preset.to_dict()
-    for name in ("scenario", "lidar", "network", "reward", "effort", "effort_team", "alpha", "credit", "rest", "noise"):
+    elsewhere = ("scenario", "lidar", "network", "reward", "effort", "effort_team", "alpha", "credit")
+    for name in (*elsewhere, "rest", "noise", "mirror"):
         training.pop(name, None)
     if preset.init is not None:
         training["init"] = Path(preset.init).name  # where it lay is nobody's business

@@ -148,6 +148,8 @@ class Preset(Settings):
     noise: float = Field(default=0.3, ge=0, le=1)
     """Of the policy when it is deployed, and validated: standard deviations by which its actions scatter about their
     mean, each for as long as a decision while learning; see `shepherd_phys.controllers.policy_files.Acting`."""
+    mirror: Literal["never", "left", "right"] = "never"
+    """Of the policy when it is deployed, and validated: which shepherds see the world in a mirror; see ``Acting``."""
     credit: Literal["own", "team"] = "own"
     """Who is paid for a term that has shares: each shepherd by its own, or all by the mean."""
     decision_interval: int = Field(default=5, ge=1, le=1000)
@@ -312,7 +314,13 @@ class Preset(Settings):
 
     def acting(self) -> Acting:
         """How its policy acts when it is deployed."""
-        return Acting(frame=self.lidar.frame, rest=self.rest, noise=self.noise, noise_steps=self.decision_interval)
+        return Acting(
+            frame=self.lidar.frame,
+            rest=self.rest,
+            noise=self.noise,
+            noise_steps=self.decision_interval,
+            mirror=self.mirror,
+        )
 
     def start(self) -> Weights | None:
         """Weights of the policy to start from, if there is one.
