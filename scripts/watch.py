@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,7 @@ from shepherd_phys.canvas import pygame_ce
 from shepherd_phys.controllers.evaluation import ControllerError
 from shepherd_phys.envs.rewards import checked
 from shepherd_phys.film import checked_film, write_film
+from shepherd_phys.render import save_png
 from shepherd_phys.settings import SettingsError
 from shepherd_phys.window import DisplayError, Window
 
@@ -61,8 +63,8 @@ class Watch:
     """The first episode: trial I of the root seed."""
     rewards: Annotated[str, flag("NAME")] = "wild"
     """The scheme whose terms the panel tells, and whose beams are drawn strongest: original, any or wild."""
-    out: Annotated[Path | None, flag("FILE.mp4|FILE.gif", "a window")] = None
-    """Write a film instead of opening a window; it needs no display."""
+    out: Annotated[Path | None, flag("FILE.mp4|.gif|.png", "a window")] = None
+    """Write a film, or its last picture, instead of opening a window; it needs no display."""
     steps: Annotated[int | None, flag("N", "the whole episode")] = None
     """Control steps of a film."""
     speed: Annotated[float | None, flag("X", "1; 8 in a film")] = None
@@ -87,7 +89,7 @@ def main(argv: Sequence[str]) -> int:
     try:
         options = read_options(argv)
         pygame_ce()
-        if options.out is not None:
+        if options.out is not None and options.out.suffix.lower() != ".png":
             checked_film(options.out, options.fps)
     except (ValueError, OSError, ImportError) as error:
         return fail(PROG, error, 2)
@@ -100,6 +102,10 @@ def main(argv: Sequence[str]) -> int:
         try:
             if options.out is None:
                 run(player, Window(player.size, " and ".join(source.name for source in sources)))
+            elif options.out.suffix.lower() == ".png":
+                (last,) = deque(film(player, options), maxlen=1)
+                save_png(last, options.out)
+                count = 1
             else:
                 count = write_film(film(player, options), options.out, options.fps)
         except DisplayError as error:
@@ -107,7 +113,7 @@ def main(argv: Sequence[str]) -> int:
         except (ControllerError, SettingsError, OSError) as error:
             return fail(PROG, error, 1)
     if options.out is not None:
-        print(f"{options.out}  ({count} pictures)")
+        print(f"{options.out}  ({count} picture{'s' * (count != 1)})")
     return 0
 
 
