@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import tyro
@@ -200,7 +200,12 @@ def run(player: Player, window: Window) -> None:
 def film(player: Player, options: Watch) -> Iterator[NDArray[np.uint8]]:
     """The pictures of a film, from the first state to the last step asked for, or the last there is."""
     yield player.canvas().picture()
-    views: list[Any] = player.views
-    while not player.over and (options.steps is None or max(view.now.state.step for view in views) < options.steps):
-        player.tick(1.0 / options.fps)
+    while not player.over:
+        seconds = 1.0 / options.fps
+        if options.steps is not None:
+            left = player.seconds_to(options.steps)
+            if left <= 0.0:
+                break
+            seconds = min(seconds, left)
+        player.tick(seconds)
         yield player.canvas().picture()
