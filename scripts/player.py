@@ -29,6 +29,8 @@ BUSY_SECONDS = 0.1
 TRAIL_SECONDS = 30.0
 FOLLOW_WIDTH = 30.0
 """[m]"""
+MARGIN = 0.12
+"""Free border of a picture that keeps all in sight, as a fraction: the panel and a camera that lags need some."""
 GRASP = 24.0
 """[px]: a press so near to a shepherd means this one."""
 SLOWING = 1.0
@@ -134,6 +136,16 @@ class Player:
     def over(self) -> bool:
         """Whether all episodes have ended."""
         return all(view.now.over for view in self.views)
+
+    def seconds_to(self, step: int) -> float:
+        """The watcher's time until the first of the views has made so many control steps [s]; a hair more."""
+        ways = [
+            (step - view.now.state.step - view.progress + 1e-9) * view.source.scenario.control_dt
+            for view in self.views
+            if not view.now.over
+        ]
+        done = max(view.now.state.step for view in self.views) >= step
+        return 0.0 if done or not ways else min(ways) / self.speed
 
     def tick(self, seconds: float) -> None:
         """Let ``seconds`` of the watcher's time pass."""
@@ -303,7 +315,7 @@ class Player:
             x, y = (state.sheep_pos.mean(axis=0) if own is None else state.shepherd_pos[own]).tolist()
             width = FOLLOW_WIDTH
         else:
-            aim = fit(self.views[k].first if self.camera == "fixed" else state, self._part)
+            aim = fit(self.views[k].first if self.camera == "fixed" else state, self._part, margin=MARGIN)
             (x, y), width = aim.center, aim.width
         return Camera(center=(x, y), width=width * self._zoom)
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import sys
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import tyro
@@ -18,6 +19,7 @@ from shepherd_phys.canvas import pygame_ce
 from shepherd_phys.controllers.evaluation import ControllerError
 from shepherd_phys.envs.rewards import checked
 from shepherd_phys.film import checked_film, write_film
+from shepherd_phys.render import save_png
 from shepherd_phys.replay import Replay
 from shepherd_phys.replay_file import load_replay
 from shepherd_phys.settings import SettingsError
@@ -65,8 +67,9 @@ class Watch:
     """The scheme whose terms the panel tells, and whose beams are drawn strongest: original, any or wild."""
     replay: Annotated[tuple[Path, ...], flag("FILE [FILE]", "")] = ()
     """Play an episode from a file instead, or two side by side; what is of playing one anew does not go with it."""
-    out: Annotated[Path | None, flag("FILE.mp4|FILE.gif|FILE.html", "a window")] = None
-    """Write a film instead of opening a window; it needs no display. A replay can become a page, FILE.html, too."""
+    out: Annotated[Path | None, flag("FILE.mp4|.gif|.png|.html", "a window")] = None
+    """Write a film, or its last picture, instead of opening a window; it needs no display. A replay can become a page,
+    FILE.html, too."""
     steps: Annotated[int | None, flag("N", "the whole episode")] = None
     """Control steps of a film."""
     speed: Annotated[float | None, flag("X", "1; 8 in a film")] = None
@@ -100,7 +103,7 @@ def main(argv: Sequence[str]) -> int:
         if options.out is not None and options.out.suffix.lower() == PAGE:
             return write_pages(replays, options.out)
         pygame_ce()
-        if options.out is not None:
+        if options.out is not None and options.out.suffix.lower() != ".png":
             checked_film(options.out, options.fps)
     except (ValueError, OSError, ImportError) as error:
         return fail(PROG, error, 2)
@@ -113,6 +116,10 @@ def main(argv: Sequence[str]) -> int:
         try:
             if options.out is None:
                 run(player, Window(player.size, " and ".join(source.name for source in sources)))
+            elif options.out.suffix.lower() == ".png":
+                (last,) = deque(film(player, options), maxlen=1)
+                save_png(last, options.out)
+                count = 1
             else:
                 count = write_film(film(player, options), options.out, options.fps)
         except DisplayError as error:
@@ -120,7 +127,7 @@ def main(argv: Sequence[str]) -> int:
         except (ControllerError, SettingsError, OSError) as error:
             return fail(PROG, error, 1)
     if options.out is not None:
-        print(f"{options.out}  ({count} pictures)")
+        print(f"{options.out}  ({count} picture{'s' * (count != 1)})")
     return 0
 
 
@@ -228,7 +235,12 @@ def run(player: Player, window: Window) -> None:
 def film(player: Player, options: Watch) -> Iterator[NDArray[np.uint8]]:
     """The pictures of a film, from the first state to the last step asked for, or the last there is."""
     yield player.canvas().picture()
-    views: list[Any] = player.views
-    while not player.over and (options.steps is None or max(view.now.state.step for view in views) < options.steps):
-        player.tick(1.0 / options.fps)
+    while not player.over:
+        seconds = 1.0 / options.fps
+        if options.steps is not None:
+            left = player.seconds_to(options.steps)
+            if left <= 0.0:
+                break
+            seconds = min(seconds, left)
+        player.tick(seconds)
         yield player.canvas().picture()

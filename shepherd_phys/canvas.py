@@ -136,6 +136,19 @@ def lettering(text: str, height: int, color: str) -> Surface:
     return _font(height).render(text, True, color)
 
 
+@lru_cache(maxsize=1)
+def _kernels() -> Any:
+    """The loops over pixels, compiled by now.
+
+    While numba compiles it keeps hold of what it was called with, and a surface whose pixels are held is locked.
+    """
+    sheet, ends = np.zeros((4, 4), dtype=np.uint32), np.zeros((1, 2))
+    _pixels.fill(sheet, (0, 0), (1, 1), ends, 1.0, (0.0, 0.0, 0.0), 1.0)
+    _pixels.stroke(sheet, ends, ends, 1.0, np.ones(1), (0.0, 0.0, 0.0))
+    _pixels.read(sheet, np.empty((4, 4, 3), dtype=np.uint8))
+    return _pixels
+
+
 class Canvas:
     """A sheet of pixels. Places are (x, y) to the right and down [px]; pixel (0, 0) covers 0 to 1."""
 
@@ -156,7 +169,7 @@ class Canvas:
         high = np.clip(np.ceil(points.max(axis=0) + radius + 1), 0, self.size).astype(int)
         if (high <= low).any():
             return
-        _pixels.fill(
+        _kernels().fill(
             self._pixels(),
             tuple(low.tolist()),
             tuple(high.tolist()),
@@ -174,7 +187,7 @@ class Canvas:
         far = 1e6  # of what is farther away, the direction may suffer
         if len(starts):
             starts, ends = (np.ascontiguousarray(np.clip(at, -far, far)) for at in (starts, ends))
-            _pixels.stroke(self._pixels(), starts, ends, width / 2, np.asarray(levels, dtype=float), _parts(color))
+            _kernels().stroke(self._pixels(), starts, ends, width / 2, np.asarray(levels, dtype=float), _parts(color))
 
     def discs(
         self,
@@ -251,7 +264,7 @@ class Canvas:
     def picture(self) -> Picture:
         """Copy the pixels: uint8 (h, w, 3)."""
         picture = np.empty((self.size[1], self.size[0], 3), dtype=np.uint8)
-        _pixels.read(self._pixels(), picture)
+        _kernels().read(self._pixels(), picture)
         return picture
 
     def _pixels(self) -> NDArray[np.uint32]:

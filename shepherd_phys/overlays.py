@@ -124,7 +124,7 @@ def draw_note(canvas: Canvas, text: str, theme: Theme) -> None:
 
 def draw_table(canvas: Canvas, rows: Sequence[tuple[str, str]], theme: Theme) -> None:
     """A plate with two columns of text in the middle."""
-    height = int(np.clip(canvas.size[1] / (1.4 * len(rows)), 12, 22))
+    height = int(np.clip(canvas.size[1] / (1.4 * len(rows)), 12, 18))
     columns = [
         [lettering(text, height, color) for text in column]
         for column, color in zip(zip(*rows, strict=True), (theme.ink, theme.faint_ink), strict=True)

@@ -80,7 +80,7 @@ def _draw_trails(canvas: Canvas, trails: Floats, theme: Theme) -> None:
 
 def _posed(points: Floats, at: Floats, ahead: Floats, scale: float) -> Floats:
     """Points (K, 2) [m] of a body at ``at`` [px], its nose along the unit vector ``ahead`` (2,), y down: [px]."""
-    return at + scale * (points[:, :1] * ahead - points[:, 1:] * np.array([-ahead[1], ahead[0]]))
+    return np.asarray(at + scale * (points[:, :1] * ahead - points[:, 1:] * np.array([-ahead[1], ahead[0]])))
 
 
 def _draw_sheep(

@@ -74,6 +74,14 @@ def test_films(tmp_path, name, words, shape):
     assert fps == pytest.approx(10)
 
 
+def test_the_last_picture_of_a_film(tmp_path):
+    words = ["--controllers", "idle", "--scenario", "small", "--size", "90", "80", "--steps", "3"]
+    done = command(tmp_path, *words, "--out", "end.png")
+    assert (done.returncode, done.stdout) == (0, "end.png  (1 picture)\n"), done.stderr
+    with Image.open(tmp_path / "end.png") as picture:
+        assert picture.size == (90, 80) and np.array(picture).std() > 3
+
+
 def test_odd_sizes_make_films_that_play(tmp_path):
     pictures = [np.full((41, 63, 3), 20 * k, np.uint8) for k in range(5)]
     assert write_film(pictures, tmp_path / "a.mp4", 10) == 5
