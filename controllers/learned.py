@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from shepherd_phys import mirror
 from shepherd_phys.lidar import Lidar, beam_directions, observe
 from shepherd_phys.state import WorldState
 
@@ -19,8 +20,6 @@ from .network import Actor
 from .policy_files import PolicySpec, read_policy
 
 SHIPPED = Path(__file__).parent / "policies"
-MIRRORED = np.array([1.0, -1.0], np.float32)
-"""An action's two numbers, along the way to the goal and across, as a mirror shows them."""
 
 
 class Policy:
@@ -92,28 +91,15 @@ class Policy:
             self._chance = acting.noise * self._rng.standard_normal((n, 2))
         if self._action is None or state.step % self._interval == 0:
             if acting.mirror != "never":
-                observation = self._in_mirror(observation)
+                if self._mirrored is None:
+                    self._mirrored = mirror.mirrored(acting.mirror, observation, self._observed)
+                observation = mirror.seen(observation, self._mirrored)
             mean, deviation = self._actor(observation)
             action = mean + self._chance * deviation if acting.noise else mean
             if self._mirrored is not None:
-                action = np.where(self._mirrored[:, None], action * MIRRORED, action)
+                action = mirror.meant(action, self._mirrored)
             self._action = _wanted(action, self._offset, self._directions, acting.rest)
         return self._action.copy()
-
-    def _in_mirror(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The observations (P, R, C), of mirrored shepherds with columns the other way round, and who they are.
-
-        Sector 0 stays where it is: it is half a beam off its own mirror image.
-        """
-        columns = observation.shape[2]
-        if self._mirrored is None:
-            channels = self.spec.lidar.channels
-            sheep = observation[:, len(channels) * (self.spec.lidar.stack - 1) + channels.index("sheep")]
-            nearest = sheep.argmax(axis=1)  # 0, straight ahead, where none is seen
-            left = (nearest > 0) & (2 * nearest < columns)
-            right = 2 * nearest > columns
-            self._mirrored = left if self.spec.action.mirror == "left" else right
-        return np.where(self._mirrored[:, None, None], observation[:, :, -np.arange(columns)], observation)
 
     def to_dict(self) -> dict[str, Any]:
         """What identifies it in results."""

@@ -24,6 +24,7 @@ from pydantic import Field
 from shepherd_phys import __version__
 from shepherd_phys.files import whole_file
 from shepherd_phys.lidar import Lidar
+from shepherd_phys.mirror import Side, check
 from shepherd_phys.scenario import Scenario
 from shepherd_phys.settings import Settings, SettingsError, settings, tagged, untagged
 
@@ -61,10 +62,8 @@ class Acting(Settings):
     of one mind that see the same may all wait for one another for good; chance ends that."""
     noise_steps: int = Field(default=5, ge=1, le=1000)
     """Control steps for which what chance adds is held; while learning those of a decision."""
-    mirror: Literal["never", "left", "right"] = "never"
-    """Where the sheep that is nearest to a shepherd when the episode begins lies on this side of its way to the goal,
-    it sees the world in a mirror, and what it wants is turned back. Learning breaks the symmetry of the task: a policy
-    goes round the goal in one sense, whichever way is shorter."""
+    mirror: Side = "never"
+    """Which shepherds see the world in a mirror."""
 
 
 @dataclass(frozen=True)
@@ -85,8 +84,10 @@ class PolicySpec:
     def __post_init__(self) -> None:
         if self.action.frame != self.lidar.frame:
             raise PolicyError(f"action.frame: must be the lidar's, {self.lidar.frame!r} (given: {self.action.frame!r})")
-        if self.action.mirror != "never" and (self.lidar.frame != "goal" or "sheep" not in self.lidar.channels):
-            raise PolicyError(f"action.mirror: needs the frame 'goal' and the channel of sheep (given: {self.lidar})")
+        try:
+            check(self.action.mirror, self.lidar)
+        except SettingsError as error:
+            raise PolicyError(f"action.{error}") from None
 
 
 FIELDS = ("format", "format_version", "version", "scenario", "lidar", "network", "action", "rewards", "training",

@@ -30,12 +30,13 @@ N_NUMBERS = N_SHEEP_CELLS + N_SHEPHERD_CELLS + 5
 _SHEEP_RINGS, _SHEPHERD_RINGS = np.array(SHEEP_RINGS), np.array(SHEPHERD_RINGS)
 
 
-def whole_world(state: WorldState, angle: Floats, view: NDArray[Any]) -> None:
+def whole_world(state: WorldState, angle: Floats, mirrored: Bools, view: NDArray[Any]) -> None:
     """Write the view of every shepherd.
 
     Args:
         state: the world now.
         angle: (P,) direction of the x axis of each shepherd's frame [rad]; 0 for world axes.
+        mirrored: (P,) whose frame is seen in a mirror, y upside down.
         view: (P, `N_NUMBERS`) float32, receives for each shepherd
 
             * 64 fractions of the sheep, row = ring x 8 + bearing, about the goal's centre. A sheep is shared linearly
@@ -49,7 +50,7 @@ def whole_world(state: WorldState, angle: Floats, view: NDArray[Any]) -> None:
     """
     _whole_world(
         state.sheep_pos, state.sheep_goal_distance, state.sheep_in_goal, state.sheep_arrived, state.shepherd_pos,
-        state.goal_pos, state.goal_radius, angle, _SHEEP_RINGS, _SHEPHERD_RINGS, view,
+        state.goal_pos, state.goal_radius, angle, mirrored, _SHEEP_RINGS, _SHEPHERD_RINGS, view,
     )  # fmt: skip
 
 
@@ -82,7 +83,7 @@ def _count(cells: Floats, ring: int, outer: float, bearing: float, amount: float
 @njit(cache=True)
 def _whole_world(
     sheep: Floats, distance: Floats, inside: Bools, arrived: Bools, shepherds: Floats, goal: Floats, radius: float,
-    angle: Floats, sheep_rings: Floats, shepherd_rings: Floats, view: Any,
+    angle: Floats, mirrored: Bools, sheep_rings: Floats, shepherd_rings: Floats, view: Any,
 ) -> None:  # fmt: skip
     """Fill ``view``; the arguments are those of `whole_world`, in its state's words."""
     n, p = len(sheep), len(shepherds)
@@ -97,16 +98,16 @@ def _whole_world(
     sheep_cells = np.empty((len(sheep_rings), N_BEARINGS))
     other_cells = np.empty((len(shepherd_rings), N_BEARINGS))
     for k in range(p):
-        turned = angle[k] * per_radian
+        turned, sign = angle[k] * per_radian, -1.0 if mirrored[k] else 1.0
         sheep_cells[:] = 0.0
         for i in range(n):
-            _count(sheep_cells, ring[i], outer[i], bearing[i] - turned, 1.0 / n)
+            _count(sheep_cells, ring[i], outer[i], sign * (bearing[i] - turned), 1.0 / n)
         other_cells[:] = 0.0
         for j in range(p):
             x, y = shepherds[j, 0] - goal[0], shepherds[j, 1] - goal[1]
             if j != k:
                 at, further = _place(math.hypot(x, y) - radius, shepherd_rings)
-                _count(other_cells, at, further, math.atan2(y, x) * per_radian - turned, 1.0 / TEAM_SCALE)
+                _count(other_cells, at, further, sign * (math.atan2(y, x) * per_radian - turned), 1.0 / TEAM_SCALE)
         place = 0
         for r in range(len(sheep_rings)):
             for b in range(N_BEARINGS):
@@ -119,7 +120,7 @@ def _whole_world(
         x, y = shepherds[k, 0] - goal[0], shepherds[k, 1] - goal[1]
         ca, sa = math.cos(angle[k]), math.sin(angle[k])
         view[k, place] = (ca * x + sa * y) / LENGTH_SCALE
-        view[k, place + 1] = (ca * y - sa * x) / LENGTH_SCALE
+        view[k, place + 1] = sign * (ca * y - sa * x) / LENGTH_SCALE
         view[k, place + 2] = n_inside / n
         view[k, place + 3] = n_arrived / n
         view[k, place + 4] = p / TEAM_SCALE

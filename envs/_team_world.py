@@ -11,8 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from shepherd_phys import mirror
 from shepherd_phys.imperfections import Sight
 from shepherd_phys.lidar import Lidar, Scan, Stack, turn
+from shepherd_phys.mirror import Side
 from shepherd_phys.scenario import Scenario
 from shepherd_phys.settings import SettingsError
 from shepherd_phys.state import WorldState
@@ -36,6 +38,7 @@ class Plan:
     decision_interval: int
     own_credit: bool
     critic: bool
+    mirror: Side
     random_clocks: bool
 
     def shapes(self) -> dict[str, tuple[int, ...]]:
@@ -73,6 +76,7 @@ class TeamWorld:
         rewards: (P,) float32 of the latest decision, written in place.
         returns: (P,) summed rewards of this episode.
         beam_offset: (P,) beams by which the observation is rolled.
+        mirrored: (P,) who sees the world in a mirror in this episode.
         seed: of this episode.
         clock: control steps by which this episode is shorter than its scenario says.
         decisions: made in this episode.
@@ -137,6 +141,7 @@ class TeamWorld:
         self.clock = self.decisions = 0
         self.returns = np.zeros(self.n_shepherds)
         self.beam_offset = np.zeros(self.n_shepherds, dtype=np.int64)
+        self.mirrored: NDArray[np.bool_] | None = None
         self._held.reset()
         self._held(self.state, measures(self.state)["is_success"])
         self._stack.reset()
@@ -155,6 +160,8 @@ class TeamWorld:
         """
         plan, world, scenario = self._plan, self.world, self.scenario
         goal_frame = plan.lidar.frame == "goal"
+        if self.mirrored is not None:
+            actions = mirror.meant(actions, self.mirrored)
         action = turn(actions, self.beam_offset, plan.lidar.beams) if goal_frame else actions
         first = world.state.step
         last = min(first + plan.decision_interval, scenario.n_steps - self.clock)
@@ -205,10 +212,16 @@ class TeamWorld:
     def _observe(self) -> None:
         """Write what the shepherds see."""
         lidar = self._plan.lidar
-        self.observation["lidar"][:], self.beam_offset = self._stack.observe(self.beam_offset)
+        seen, self.beam_offset = self._stack.observe(self.beam_offset)
+        if self._plan.mirror != "never":
+            if self.mirrored is None:
+                self.mirrored = mirror.mirrored(self._plan.mirror, seen, lidar)
+            seen = mirror.seen(seen, self.mirrored)
+        self.observation["lidar"][:] = seen
         if self._plan.critic:
             angle = np.multiply(self.beam_offset, 2.0 * np.pi / lidar.beams, dtype=np.float64)
-            whole_world(self.state, angle, self.observation["critic"])
+            who = np.zeros(self.n_shepherds, np.bool_) if self.mirrored is None else self.mirrored
+            whole_world(self.state, angle, who, self.observation["critic"])
 
     def render(self, size: tuple[int, int] = (320, 320)) -> NDArray[np.uint8]:
         """A picture (height, width, 3) of the state."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from gymnasium import spaces
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
 from shepherd_phys.lidar import Lidar
+from shepherd_phys.mirror import Side, check
 from shepherd_phys.scenario import Scenario, load_scenario
 from shepherd_phys.settings import SettingsError
 
@@ -92,6 +93,7 @@ class TeamVecEnv(VecEnv):
     | decision_interval | 1 | control steps of a decision |
     | credit | ``"team"`` | or ``"own"`` |
     | critic | ``"own"`` | what the critic sees more than the actor: nothing, or the ``"world"`` |
+    | mirror | ``"never"`` | which shepherds see the world in a mirror, the critic's view and the action included; see `shepherd_phys.mirror` |
     | random_clocks | ``True`` | whether first episodes are cut short at random |
     | seed | 1,000,000 | root; from there upward is meant for training |
     | n_workers | 0 | worker processes; 0: all worlds in this one. Functions and classes of your own then need to be those of a module, and a script its ``if __name__ == "__main__":`` |
@@ -112,6 +114,7 @@ class TeamVecEnv(VecEnv):
         decision_interval: int = 1,
         credit: Literal["team", "own"] = "team",
         critic: Literal["own", "world"] = "own",
+        mirror: Side = "never",
         random_clocks: bool = True,
         seed: int = 1_000_000,
         n_workers: int = 0,
@@ -126,6 +129,8 @@ class TeamVecEnv(VecEnv):
             raise SettingsError(f"lidar: needs a Lidar or None (given: {lidar!r})")
         _one_of("credit", credit, ("team", "own"))
         _one_of("critic", critic, ("own", "world"))
+        _one_of("mirror", mirror, get_args(Side))
+        check(mirror, lidar)
         _one_of("render_mode", render_mode, (None, "rgb_array"))
         if not isinstance(team_sizes, Sequence | np.ndarray) or not len(team_sizes):
             raise SettingsError(f"team_sizes: needs one number or more, one a world (given: {team_sizes!r})")
@@ -141,6 +146,7 @@ class TeamVecEnv(VecEnv):
             decision_interval=self.decision_interval,
             own_credit=credit == "own",
             critic=critic == "world",
+            mirror=mirror,
             random_clocks=random_clocks,
         )
         scans_for(plan.scheme, lidar)  # what it raises should not have to come from a worker

@@ -80,8 +80,8 @@ def episode_seeds(root, number, world):
         yield int(generator.integers(2**63))
 
 
-def view(state, angle):
+def view(state, angle, mirrored=False):
     """What the critic sees of a state, (P, 101)."""
     seen = np.full((state.n_shepherds, critic.N_NUMBERS), np.nan, np.float32)
-    critic.whole_world(state, np.array(angle, float), seen)
+    critic.whole_world(state, np.array(angle, float), np.full(len(seen), mirrored), seen)
     return seen

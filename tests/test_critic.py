@@ -40,3 +40,12 @@ def test_the_critics_view_turns_with_the_frame_and_does_not_care_who_is_who():
     order = [2, 0, 3, 1]
     mixed = view(arranged(sheep[::-1], shepherds[order]), [0.0] * 4)
     assert mixed == pytest.approx(seen[order], abs=1e-6)
+
+
+def test_the_critic_in_a_mirror_sees_the_mirrored_world():
+    rng = np.random.default_rng(4)
+    sheep, shepherds, angle = rng.normal(0, 15, (30, 2)), rng.normal(0, 15, (3, 2)), rng.uniform(-3, 3, 3)
+    flip = np.array([1.0, -1.0])
+    mirrored = view(arranged(sheep, shepherds), angle, mirrored=True)
+    np.testing.assert_allclose(mirrored, view(arranged(sheep * flip, shepherds * flip), -angle), atol=1e-6)
+    assert not np.allclose(mirrored, view(arranged(sheep, shepherds), angle))

@@ -23,7 +23,7 @@ ORDER = (
     ("placement", "avoidance"),
     ("layouts",),
     ("flock", "lidar"),
-    ("imperfections",),
+    ("imperfections", "mirror"),
     ("scenario",),
     ("world",),
     ("canvas", "cluster", "ledger", "replay"),

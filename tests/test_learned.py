@@ -257,7 +257,7 @@ def test_who_has_the_nearest_sheep_on_that_side_sees_the_world_in_a_mirror():
 
 @pytest.mark.parametrize("lidar", [Lidar(), Lidar(frame="goal", channels=("goal",))])
 def test_a_mirror_needs_the_goal_ahead_and_sheep_to_see(lidar):
-    with pytest.raises(PolicyError, match=r"action.mirror: needs the frame 'goal' and the channel of sheep"):
+    with pytest.raises(PolicyError, match=r"action.mirror: needs the frame 'goal', the channel of sheep"):
         spec_of(lidar, mirror="left")
 
 

@@ -11,6 +11,7 @@ from stable_baselines3.common.buffers import DictRolloutBuffer
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
+from shepherd_phys import mirror
 from shepherd_phys.envs import WILD, ShepherdingEnv
 from shepherd_phys.envs import _critic as critic
 from shepherd_phys.envs.rewards import Effort
@@ -125,6 +126,38 @@ def test_the_goal_frame_follows_every_scan_even_those_that_nobody_acts_on():
         inside += int(np.linalg.norm(env.state.shepherd_pos) < near.goal_radius)
         assert team.step(action)[0]["lidar"].tobytes() == last.tobytes()
     assert inside >= 3
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_mirrored_shepherds_see_and_mean_the_other_side(side):
+    lidar = Lidar(sectors=64, frame="goal")
+    how = dict(scenario=SMALL, team_sizes=(2, 3), lidar=lidar, decision_interval=3, critic="world", seed=3)
+    plain, other = TeamVecEnv(**how), TeamVecEnv(**how, mirror=side)
+    rng, whos = np.random.default_rng(0), []
+    straight, seen = plain.reset(), other.reset()
+    who = mirror.mirrored(side, straight["lidar"], lidar)
+    dones = np.zeros(5, bool)
+    for _ in range(60):
+        whos.append(who)
+        np.testing.assert_array_equal(seen["lidar"], mirror.seen(straight["lidar"], who))
+        np.testing.assert_array_equal(seen["critic"][~who], straight["critic"][~who])
+        assert (seen["critic"][who] != straight["critic"][who]).any(axis=1).all()
+        wanted = actions(plain, rng)
+        straight, rewards, dones, _ = plain.step(mirror.meant(wanted, who))
+        seen, same, _, _ = other.step(wanted)
+        np.testing.assert_array_equal(rewards, same)
+        who = np.where(dones, mirror.mirrored(side, straight["lidar"], lidar), who)
+    whos = np.array(whos)
+    assert whos.any() and not whos.all() and (whos.any(axis=0) & ~whos.all(axis=0)).any()  # episodes differ
+    plain.close()
+    other.close()
+
+
+def test_a_mirror_needs_the_goal_ahead():
+    with pytest.raises(SettingsError, match="mirror: needs the frame 'goal'"):
+        TeamVecEnv(SMALL, lidar=COMPACT, mirror="left")
+    with pytest.raises(SettingsError, match="mirror"):
+        TeamVecEnv(SMALL, lidar=Lidar(frame="goal"), mirror="up")
 
 
 def test_shares_average_to_the_teams_reward():

@@ -57,6 +57,7 @@ class Learner:
             decision_interval=preset.decision_interval,
             credit=preset.credit,
             critic=preset.critic_sees,
+            mirror=preset.mirror,
             seed=preset.seed,
             n_workers=n_workers,
         )

@@ -22,6 +22,7 @@ from shepherd_phys.controllers.policy_files import MAX_FRAMES, MAX_WEIGHTS, Acti
 from shepherd_phys.envs.mixture import Mixture
 from shepherd_phys.envs.rewards import SCHEMES, Effort, Gathered, Occlusion, Term
 from shepherd_phys.lidar import Lidar
+from shepherd_phys.mirror import Side, check
 from shepherd_phys.scenario import SCENARIOS, Scenario
 from shepherd_phys.settings import Settings, SettingsError, read_toml, settings, write_toml
 
@@ -148,8 +149,8 @@ class Preset(Settings):
     noise: float = Field(default=0.3, ge=0, le=1)
     """Of the policy when it is deployed, and validated: standard deviations by which its actions scatter about their
     mean, each for as long as a decision while learning; see `shepherd_phys.controllers.policy_files.Acting`."""
-    mirror: Literal["never", "left", "right"] = "never"
-    """Of the policy when it is deployed, and validated: which shepherds see the world in a mirror; see ``Acting``."""
+    mirror: Side = "never"
+    """Which shepherds see the world in a mirror, while learning and when deployed; see `shepherd_phys.mirror`."""
     credit: Literal["own", "team"] = "own"
     """Who is paid for a term that has shares: each shepherd by its own, or all by the mean."""
     decision_interval: int = Field(default=5, ge=1, le=1000)
@@ -216,6 +217,7 @@ class Preset(Settings):
             )
         try:
             shapes = self.network.shapes(self.lidar)
+            check(self.mirror, self.lidar)
             self.draw()
             self.acting()  # what no policy file can say is refused before anything is learned
         except SettingsError as error:
