@@ -307,6 +307,13 @@ def test_seeds_of_one_recipe_are_averaged(tmp_path, monkeypatch):
     assert out.read_bytes().startswith(STARTS["png"])
 
 
+def test_runs_without_a_whole_episode_yet_say_so(tmp_path):
+    run = run_folder(tmp_path / "young", rollouts=2, validated=False)
+    out = tmp_path / "learning.svg"
+    assert main.main(["plot", "learning", str(run), "--out", str(out)]) == 0
+    assert "nothing yet" in out.read_text(encoding="utf-8")
+
+
 def test_recipes_with_folders_of_the_same_name_are_told_apart(tmp_path):
     for name, reward in (("a", "wild"), ("b", "any")):
         (tmp_path / name).mkdir()
