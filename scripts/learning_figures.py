@@ -115,6 +115,9 @@ def draw_runs(
                 curve = curve_of(rows, recipe, reward, measure)
                 seeds = f" ({len(curve.seeds)} seeds)" if len(curve.seeds) > 1 else ""
                 line(axes, curve.steps, curve.values, color, style, f"{recipe}{seeds}")
+            if not any(len(drawn_line.get_xdata()) for drawn_line in axes.lines):
+                axes.text(0.5, 0.5, "nothing yet", transform=axes.transAxes, ha="center", color=GREY, fontsize=9)
+                axes.set_yticks([])
             axes.set_title(f"{letter(k, len(panels))}{title}", fontsize=10, loc="left")
             if "%" in title:
                 axes.set_ylim(-4.0, 104.0)

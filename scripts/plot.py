@@ -22,6 +22,7 @@ from shepherd_phys.controllers.summary import summarise
 from shepherd_phys.learning.folder import CURVE, PRESET, VALIDATION
 from shepherd_phys.learning.folder import MEASURES as VALIDATED
 from shepherd_phys.settings import SettingsError, read_toml
+from shepherd_phys.workers import explain
 
 from .command import at_least, cpu_count, fail, flag, parsed, progress_bar
 from .curves import MEASURES as TRAINED
@@ -285,13 +286,19 @@ def draw_trajectories(options: Trajectories) -> bytes:
     Raises:
         SettingsError: something is unknown or impossible.
         ControllerError: the controller is none, or acts as none may.
+        CampaignError: something in the episode failed.
     """
     from . import path_figures
     from .paths import walks
 
     (point,) = one_point(options, [options.controller])
     place(point, [options.seed])
-    walk = walks(point, options.seed)
+    try:
+        walk = walks(point, options.seed)
+    except (SettingsError, ControllerError):
+        raise
+    except Exception as error:  # of a user's own class
+        raise CampaignError(f"{point}, seed {options.seed}: {explain(error)}") from None
     return path_figures.draw_trajectories(point, options.seed, walk, options.color, kind_of_file(options.out))
 
 

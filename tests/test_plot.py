@@ -264,7 +264,15 @@ def test_heat_maps_do_not_depend_on_workers(tmp_path):
     assert files[0].startswith(STARTS["png"])
 
 
-def test_a_controller_that_fails_leaves_no_map(tmp_path):
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("heatmap", "--controllers", "mine:Faint", "--trials", "1", "--workers", "1", "--out", "figure.png"),
+        ("trajectories", "--controller", "mine:Faint", "--out", "figure.png"),
+    ],
+    ids=lambda words: words[0],
+)
+def test_a_controller_that_fails_leaves_no_figure(tmp_path, words):
     """From the folder of a user's own file."""
     (tmp_path / "mine.py").write_text(
         "class Faint:\n    lidar = None\n    def reset(self, rng): raise RuntimeError('not today')\n"
@@ -272,14 +280,18 @@ def test_a_controller_that_fails_leaves_no_map(tmp_path):
         encoding="utf-8",
     )
     TINY.to_toml(tmp_path / "tiny.toml")
-    words = ["heatmap", "--controllers", "mine:Faint", "--scenario", "tiny.toml", "--trials", "1", "--workers", "1"]
     command = str(Path(sys.executable).with_name("shepherd-phys"))
     done = subprocess.run(
-        [command, "plot", *words], cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False
+        [command, "plot", *words, "--scenario", "tiny.toml"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
     )
     assert done.returncode == 1
     assert "not today" in done.stderr.splitlines()[-1]
-    assert not (tmp_path / "heatmap.png").exists()
+    assert not (tmp_path / "figure.png").exists()
 
 
 def test_seeds_of_one_recipe_are_averaged(tmp_path, monkeypatch):
@@ -305,6 +317,13 @@ def test_seeds_of_one_recipe_are_averaged(tmp_path, monkeypatch):
     assert main.main(["plot", "learning", str(runs[0]), "--smooth", "4", "--out", str(out)]) == 0
     assert len(handed[0][1]) == 2  # the last two rollouts are no whole four
     assert out.read_bytes().startswith(STARTS["png"])
+
+
+def test_runs_without_a_whole_episode_yet_say_so(tmp_path):
+    run = run_folder(tmp_path / "young", rollouts=2, validated=False)
+    out = tmp_path / "learning.svg"
+    assert main.main(["plot", "learning", str(run), "--out", str(out)]) == 0
+    assert "nothing yet" in out.read_text(encoding="utf-8")
 
 
 def test_recipes_with_folders_of_the_same_name_are_told_apart(tmp_path):
