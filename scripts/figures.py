@@ -35,6 +35,7 @@ together, in steps between points."""
 
 BLUE, GREEN, ORANGE, PURPLE = "#0072B2", "#009E73", "#E69F00", "#CC79A7"
 SKY, VERMILION, BLACK, GREY = "#56B4E9", "#D55E00", "#000000", "#808080"
+BROWN = "#7A5230"
 # Okabe and Ito's colours, which the colour-blind tell apart; as published: the tuned one's, hollow and dashed
 STYLES = {
     "strombom": (BLUE, "o"),
@@ -45,12 +46,12 @@ STYLES = {
     "any": (SKY, "v"),
     "wild": (VERMILION, "*"),
     "collie": (BLACK, "P"),
-    "collie-obstacles": (VERMILION, "P"),
+    "collie-obstacles": (BROWN, "p"),
     "strombom-literal": (BLUE, "o"),
     "pierson-reconstructed": (GREEN, "s"),
     "elfiqi-literal": (ORANGE, "^"),
 }
-OTHERS = [(color, marker) for marker in "hp<>d8" for color in (BLACK, GREY)]
+OTHERS = [(color, marker) for marker in "h<>d8" for color in (BLACK, GREY)]
 """For controllers of a user's own."""
 
 

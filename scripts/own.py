@@ -31,7 +31,7 @@ def find_kinds(body: str | None, flock: str | None) -> dict[str, type[Any]]:
     return {where: find_class(name, known, where) for where, (name, known) in named.items() if name is not None}
 
 
-def find_scenario(name: str, classes: Iterable[type[Any]]) -> Scenario:
+def find_scenario(name: str, classes: Iterable[type[Any]] = ()) -> Scenario:
     """A preset by its name, from a TOML file, or ``module:Name`` of a user's own or of a function that makes one.
 
     Raises:

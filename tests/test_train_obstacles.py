@@ -12,7 +12,7 @@ from shepherd_phys.scripts.train import Train, asked, main, prepare
 
 
 def prepared(words):
-    return prepare(*parsed(Train, "train", words.split()))
+    return prepare(*parsed(Train, "train", words.split()), {})
 
 
 @pytest.mark.parametrize(
@@ -38,7 +38,7 @@ def test_a_run_gets_its_obstacles_and_a_folder_of_its_own(words, layout, folder,
 
 
 def test_a_scenario_says_where_its_flocks_are():
-    preset = asked(load_preset("collie"), *parsed(Train, "train", ["--scenario", "fence"]))
+    preset = asked(load_preset("collie"), *parsed(Train, "train", ["--scenario", "fence"]), {})
     assert preset.flock_distance is None
     assert preset.draw().base.flock_distance == (14.0, 20.0)
 
