@@ -10,9 +10,10 @@ import pytest
 from shepherd_phys.controllers.claims import EXPERIMENTS, judge
 from shepherd_phys.controllers.curves import COLUMNS
 from shepherd_phys.controllers.evaluation import LABELS
+from shepherd_phys.scripts.beyond import PAPER, STUDIES
 from shepherd_phys.scripts.curves import VALIDATIONS, read_rows
 from shepherd_phys.scripts.learning_pages import ablations_page, figure1_page
-from shepherd_phys.scripts.pages import claims_page, figure_page
+from shepherd_phys.scripts.pages import claims_page, figure_page, study_page
 from shepherd_phys.scripts.points import points
 from shepherd_phys.scripts.studies import HOME_COLUMNS
 
@@ -25,6 +26,7 @@ FILES = [
     *(f"{name}.{kind}" for name in EXPERIMENTS for kind in ("csv", "md", "png")),
     *(name for names in LEARNING.values() for name in names),
     *("claims.json", "claims.md"),
+    *(f"{name}.{kind}" for name in STUDIES for kind in ("csv", "md", "png")),
 ]
 LINKED = [name for name in FILES if name.endswith((".md", ".png"))]
 
@@ -115,6 +117,21 @@ def test_the_guides_results_are_of_the_controllers_and_the_world_as_they_are(nam
         pytest.skip("no results are committed")
     for row in read(REPRODUCTION / f"{name}.csv"):
         (point,) = points(controllers=[row["controller"]], flocks=[row["n_flocks"]], cohesion=[row["cohesion"]])
+        assert point.settings_hash() == row["settings_hash"], str(point)
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_the_guides_studies_say_what_their_csvs_hold_of_the_controllers_and_worlds_as_they_are(name):
+    if not (REPRODUCTION / f"{name}.csv").exists():
+        pytest.skip("no results are committed")
+    study = STUDIES[name]
+    rows = read(REPRODUCTION / f"{name}.csv")
+    told = [{column: None if value == "" else value for column, value in row.items()} for row in rows]
+    page = study_page(name, study.title, study.intro, study.baseline, told)
+    assert (REPRODUCTION / f"{name}.md").read_text("utf-8") == page
+    assert (REPRODUCTION / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+    for row in rows:
+        (point,) = points(controllers=[row["controller"]], **{**PAPER, **study.cases[row["case"]]})
         assert point.settings_hash() == row["settings_hash"], str(point)
 
 
