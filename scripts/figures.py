@@ -241,9 +241,12 @@ def _bars(
     below = [row[f"{metric}_mean"] - row[f"{metric}_low"] for row in rows]
     above = [row[f"{metric}_high"] - row[f"{metric}_mean"] for row in rows]
     color, marker = style
+    spread = [below, above]
     axes.errorbar(
-        *((mean, at) if lying else (at, mean)),
-        **{"xerr" if lying else "yerr": [below, above]},
+        x=mean if lying else at,
+        y=at if lying else mean,
+        xerr=spread if lying else None,
+        yerr=None if lying else spread,
         label=method,
         color=color,
         marker=marker,

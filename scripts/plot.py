@@ -269,14 +269,15 @@ def one_point(options: Trajectories | Heatmap, controllers: Sequence[str]) -> li
         ControllerError: an object given as controller is none.
     """
     at_least({name: getattr(options, name) for name in LEAST}, LEAST)
-    lists = {name: getattr(options, name) for name in ("flocks", "cohesion", "shepherds")}
+    given = {name: getattr(options, name) for name in ("flocks", "cohesion", "shepherds")}
+    lists: dict[str, Any] = {name: () if value is None else (value,) for name, value in given.items()}
     return points(
         controllers=controllers,
         scenario=options.scenario,
         sheep=options.sheep,
         body=options.body,
         flock=options.flock,
-        **{name: () if value is None else (value,) for name, value in lists.items()},
+        **lists,
     )
 
 

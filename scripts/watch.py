@@ -182,7 +182,7 @@ def live(options: Watch) -> list[Source]:
         SettingsError: a name is unknown, or a world cannot be made.
         ControllerError: an object given as controller is none.
     """
-    lists = {
+    lists: dict[str, Any] = {
         name: () if value is None else (value,)
         for name, value in ((name, getattr(options, name)) for name in ("flocks", "cohesion", "shepherds"))
     }

@@ -51,6 +51,6 @@ def seen(observation: NDArray[np.float32], who: NDArray[np.bool_]) -> NDArray[An
     return np.where(who[:, None, None], observation[:, :, -np.arange(observation.shape[2])], observation)
 
 
-def meant(actions: NDArray[np.float32], who: NDArray[np.bool_]) -> NDArray[np.float32]:
+def meant(actions: NDArray[Any], who: NDArray[np.bool_]) -> NDArray[Any]:
     """What actions (P, 2) in the goal frame mean of those who (P,) see in a mirror; it is its own reverse."""
     return np.where(who[:, None], actions * ACTION, actions)

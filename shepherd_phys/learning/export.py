@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +49,7 @@ def actor_weights(policy: TeamPolicy) -> dict[str, NDArray[np.float32]]:
     return {name: parameter.detach().cpu().numpy().copy() for name, parameter in _actor(policy).items()}
 
 
-def load_actor(policy: TeamPolicy, weights: dict[str, NDArray[np.float32]]) -> None:
+def load_actor(policy: TeamPolicy, weights: Mapping[str, NDArray[np.float32]]) -> None:
     """Put a policy's weights into the actor.
 
     Raises:
