@@ -15,7 +15,7 @@ from matplotlib.colors import LinearSegmentedColormap, LogNorm, Normalize
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon
 
-from shepherd_phys.obstacles import Obstacle, solid
+from shepherd_phys.obstacles import Obstacle, outlines
 from shepherd_phys.placement import flock_of
 from shepherd_phys.render import THEMES
 from shepherd_phys.state import Floats
@@ -58,7 +58,7 @@ def draw_trajectories(point: Point, seed: int, walk: Walks, coloring: Coloring, 
     width, height = SIDE * (high - low) / max(high - low)
     with picture(kind, (max(width, 4.2) + (1.6 if coloring == "time" else 0.8), max(height, 2.5) + 1.6)) as drawn:
         axes = drawn.figure.subplots()
-        _ground(axes, goal, radius, outlines(walk.start.obstacles))
+        _ground(axes, goal, radius, corners(walk.start.obstacles))
         if coloring == "time":
             _by_time(axes, walk)
         else:
@@ -145,18 +145,11 @@ def draw_maps(found: Sequence[Map], who: Who, frame: Frame, about: str, goal_rad
     return drawn.content
 
 
-def outlines(obstacles: Sequence[Obstacle]) -> list[Floats]:
+def corners(obstacles: Sequence[Obstacle]) -> list[Floats]:
     """Corners (K, 2) [m] of every shape of the obstacles, round ones as polygons."""
-    body = pymunk.Space().static_body
     found = []
-    for shape in (shape for index, one in enumerate(obstacles) for shape in solid(one, index, body)):
-        if isinstance(shape, pymunk.Circle):
-            points = [shape.offset]
-        elif isinstance(shape, pymunk.Segment):
-            points = [shape.a, shape.b]
-        else:
-            points = shape.get_vertices()
-        grown = [(x + shape.radius * c, y + shape.radius * s) for x, y in points for c, s in ROUND]
+    for shape in (shape for index, one in enumerate(obstacles) for shape in outlines(one, index)):
+        grown = [(x + shape.radius * c, y + shape.radius * s) for x, y in shape.points.tolist() for c, s in ROUND]
         found.append(np.array(pymunk.Poly(None, grown).get_vertices()))  # which takes their convex hull
     return found
 

@@ -242,12 +242,14 @@ def outlines(obstacle: Obstacle, index: int) -> list[Outline]:
     Raises:
         SettingsError: it is no obstacle; the message calls it the one of this index.
     """
-    drawn = []
-    for shape in solid(obstacle, index, pymunk.Body(body_type=pymunk.Body.STATIC)):
-        if isinstance(shape, pymunk.Circle):
-            drawn.append(Outline([shape.offset], shape.radius))
-        elif isinstance(shape, pymunk.Segment):
-            drawn.append(Outline([shape.a, shape.b], shape.radius))
-        elif isinstance(shape, pymunk.Poly):
-            drawn.append(Outline(shape.get_vertices(), shape.radius))
-    return drawn
+    shapes = solid(obstacle, index, pymunk.Body(body_type=pymunk.Body.STATIC))
+    return [drawn for drawn in map(outline, shapes) if drawn is not None]
+
+
+def outline(shape: pymunk.Shape) -> Outline | None:
+    """What is drawn of a shape, in its body's coordinates; None of one that is no disc, segment or polygon."""
+    if isinstance(shape, pymunk.Circle):
+        return Outline([shape.offset], shape.radius)
+    if isinstance(shape, pymunk.Segment):
+        return Outline([shape.a, shape.b], shape.radius)
+    return Outline(shape.get_vertices(), shape.radius) if isinstance(shape, pymunk.Poly) else None

@@ -5,15 +5,11 @@ A hull is the convex hull of some points (K, 2) [m], grown by a radius [m].
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from functools import lru_cache
 from typing import Any
 
-import numpy as np
-import pymunk
-
 from shepherd_phys.bodies import Body
-from shepherd_phys.obstacles import Obstacle, solid
+from shepherd_phys.obstacles import Obstacle, outline, outlines
 from shepherd_phys.settings import Foreign
 from shepherd_phys.state import Floats
 
@@ -36,9 +32,8 @@ class Same:
 @lru_cache(maxsize=16)
 def of_obstacles(obstacles: Same) -> list[Hull]:
     """Every shape of a tuple of obstacles, whatever class they are of, in world coordinates."""
-    ground = pymunk.Space().static_body
     given: tuple[Obstacle, ...] = obstacles.value
-    return _hulls(shape for index, one in enumerate(given) for shape in solid(one, index, ground))
+    return [(drawn.points, drawn.radius) for index, one in enumerate(given) for drawn in outlines(one, index)]
 
 
 @lru_cache(maxsize=64)
@@ -50,18 +45,6 @@ def of_body(body: Same) -> list[Hull]:
     own: Body | Foreign = body.value
     if isinstance(own, Foreign):
         return []
-    hulls = _hulls(own.build()[1])
-    is_disc = len(hulls) == 1 and len(hulls[0][0]) == 1 and not hulls[0][0].any()
-    return [] if is_disc else hulls
-
-
-def _hulls(shapes: Iterable[pymunk.Shape]) -> list[Hull]:
-    hulls: list[Hull] = []
-    for shape in shapes:
-        if isinstance(shape, pymunk.Circle):
-            hulls.append((np.array([shape.offset], dtype=float), shape.radius))
-        elif isinstance(shape, pymunk.Segment):
-            hulls.append((np.array([shape.a, shape.b], dtype=float), shape.radius))
-        elif isinstance(shape, pymunk.Poly):
-            hulls.append((np.array(shape.get_vertices(), dtype=float), shape.radius))
-    return hulls
+    drawn = [one for one in map(outline, own.build()[1]) if one is not None]
+    is_disc = len(drawn) == 1 and len(drawn[0].points) == 1 and not drawn[0].points.any()
+    return [] if is_disc else [(one.points, one.radius) for one in drawn]

@@ -16,7 +16,6 @@ pytest.importorskip("matplotlib")
 from shepherd_phys.obstacles import Box, Pillar, Wall
 from shepherd_phys.scenario import SCENARIOS
 from shepherd_phys.scripts import learning_figures, main, plot
-from shepherd_phys.scripts.path_figures import outlines
 from shepherd_phys.scripts.paths import CELL, CELLS, REACH, Mapped, maps, stood, turned, walks
 from shepherd_phys.scripts.points import Point
 from shepherd_phys.settings import SettingsError
@@ -236,7 +235,7 @@ def test_a_map_counts_every_second():
 
 
 def test_outlines_hold_the_obstacles():
-    pillar, wall, box = outlines([Pillar((1.0, 2.0), 0.5), Wall((0, 0), (4, 0), 0.2), Box((5.0, 5.0), (2.0, 1.0))])
+    pillar, wall, box = corners([Pillar((1.0, 2.0), 0.5), Wall((0, 0), (4, 0), 0.2), Box((5.0, 5.0), (2.0, 1.0))])
     np.testing.assert_allclose(np.linalg.norm(pillar - (1.0, 2.0), axis=1), 0.5)
     np.testing.assert_allclose([wall.min(axis=0), wall.max(axis=0)], [[-0.1, -0.1], [4.1, 0.1]], atol=1e-9)
     np.testing.assert_allclose([box.min(axis=0), box.max(axis=0)], [[4.0, 4.5], [6.0, 5.5]], atol=1e-9)
