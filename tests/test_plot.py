@@ -16,6 +16,7 @@ pytest.importorskip("matplotlib")
 from shepherd_phys.obstacles import Box, Pillar, Wall
 from shepherd_phys.scenario import SCENARIOS
 from shepherd_phys.scripts import learning_figures, main, plot
+from shepherd_phys.scripts.path_figures import corners
 from shepherd_phys.scripts.paths import CELL, CELLS, REACH, Mapped, maps, stood, turned, walks
 from shepherd_phys.scripts.points import Point
 from shepherd_phys.settings import SettingsError
