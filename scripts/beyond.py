@@ -158,7 +158,7 @@ def run_study(name: str, folder: Path, *, controllers: Sequence[str], reported: 
             apart = {row["controller"]: row for row in paired_differences(mine, str(study.baseline), (DELIVERED,))}
         for row in summarise(mine):
             theirs = apart.get(row["controller"])
-            mean, low, high = (None if theirs is None else -theirs[f"{DELIVERED}_diff_{of}"] for of in PARTS)
+            mean, low, high = (None if theirs is None else 0.0 - theirs[f"{DELIVERED}_diff_{of}"] for of in PARTS)
             ahead = dict(zip(AHEAD, (mean, high, low), strict=True))
             summary.append({"case": title, **row, **ahead, "settings_hash": hashes[row["controller"]]})
     summary.sort(key=lambda row: (list(study.cases).index(row["case"]), methods.index(row["controller"])))

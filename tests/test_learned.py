@@ -639,7 +639,7 @@ def texts(data):
 
 
 def test_every_shipped_policy_is_a_controller_and_whole():
-    assert set(POLICIES) == {"any", "collie", "original", "wild"}
+    assert set(POLICIES) == {"any", "collie", "collie-obstacles", "original", "wild"}
     for name in POLICIES:
         assert CONTROLLERS[name] is POLICIES[name]
         policy = POLICIES[name]()
@@ -648,8 +648,10 @@ def test_every_shipped_policy_is_a_controller_and_whole():
         assert said and not [text for text in said if "/" in text]  # no path of whoever trained it
 
 
-@pytest.mark.parametrize("name", ["wild", "collie"])
-def test_a_shipped_policy_brings_the_sheep_home(name):
+@pytest.mark.parametrize(
+    ("name", "scenario"), [("wild", "paper"), ("collie", "paper"), ("collie-obstacles", "scattered")]
+)
+def test_a_shipped_policy_brings_the_sheep_home(name, scenario):
     """A whole episode on a validation seed."""
-    (row,) = evaluate(POLICIES[name](), partial(ShepherdingEnv, SCENARIOS["paper"]), [trial_seed(10_000, 0)])
+    (row,) = evaluate(POLICIES[name](), partial(ShepherdingEnv, SCENARIOS[scenario]), [trial_seed(10_000, 0)])
     assert row["in_goal_end"] >= 95.0

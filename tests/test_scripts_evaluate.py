@@ -495,7 +495,7 @@ def test_a_world_that_cannot_be_placed_is_one_error(folder, in_process, capsys):
 # ---- mistakes -----------------------------------------------------------------------------------------------------
 
 MISTAKES = [
-    ("--controllers nobody", "controllers: 'nobody' is unknown; there are any, collie, elfiqi, "),
+    ("--controllers nobody", "controllers: 'nobody' is unknown; there are any, collie, collie-obstacles, elfiqi, "),
     ("--controllers", "--controllers: needs at least one value"),
     ("--controllers mine:Half", "controller Half: lacks act; a controller has lidar"),
     ("--controllers mine:Odd", "parameters must be plain data"),
