@@ -28,7 +28,8 @@ from .command import at_least, cpu_count, fail, flag, parsed, progress_bar
 from .curves import MEASURES as TRAINED
 from .curves import binned, read_rows
 from .episode_tables import VARIED, chosen, once, read_episodes
-from .points import Point, place, points
+from .points import LEAST as WORLD_LEAST
+from .points import WorldFlags, place
 
 PROG = "shepherd-phys plot"
 ENDINGS = ("png", "svg", "pdf")
@@ -82,25 +83,11 @@ class Measures:
 
 
 @dataclass(frozen=True)
-class Trajectories:
+class Trajectories(WorldFlags):
     """Run one episode and draw its paths, overlaid."""
 
     controller: Annotated[str, flag("NAME|FILE|module:Name")] = "collie"
     """Who moves the shepherds."""
-    flocks: Annotated[int | None, flag("K", "the scenario's")] = None
-    """Number of flocks."""
-    cohesion: Annotated[int | None, flag("N", "the scenario's")] = None
-    """Number of neighbours that attract a sheep."""
-    shepherds: Annotated[int | None, flag("M", "the scenario's")] = None
-    """Number of shepherds."""
-    sheep: Annotated[int | None, flag("N", "the scenario's")] = None
-    """Number of sheep."""
-    scenario: Annotated[str, flag("NAME|FILE|module:Name")] = "paper"
-    """A preset's name, a TOML file, or module:Name of a scenario of your own."""
-    body: Annotated[str | None, flag("NAME|module:Name", "the scenario's")] = None
-    """Body of every shepherd."""
-    flock: Annotated[str | None, flag("NAME|module:Name", "the scenario's")] = None
-    """Flock model."""
     seed: Annotated[int, flag("S", "that of evaluate's first trial")] = trial_seed(ROOT_SEED, 0)
     """Of the episode, as the column seed of episodes.csv tells it."""
     color: Annotated[Literal["time", "flock"], flag("time|flock")] = "time"
@@ -110,25 +97,11 @@ class Trajectories:
 
 
 @dataclass(frozen=True)
-class Heatmap:
+class Heatmap(WorldFlags):
     """Run many episodes and map how long shepherds or sheep stand where, seen from the goal."""
 
     controllers: Annotated[tuple[str, ...], flag("NAME ..")] = ("collie",)
     """Controllers by name, or module:Name of your own; a map each."""
-    flocks: Annotated[int | None, flag("K", "the scenario's")] = None
-    """Number of flocks."""
-    cohesion: Annotated[int | None, flag("N", "the scenario's")] = None
-    """Number of neighbours that attract a sheep."""
-    shepherds: Annotated[int | None, flag("M", "the scenario's")] = None
-    """Number of shepherds."""
-    sheep: Annotated[int | None, flag("N", "the scenario's")] = None
-    """Number of sheep."""
-    scenario: Annotated[str, flag("NAME|FILE|module:Name")] = "paper"
-    """A preset's name, a TOML file, or module:Name of a scenario of your own."""
-    body: Annotated[str | None, flag("NAME|module:Name", "the scenario's")] = None
-    """Body of every shepherd."""
-    flock: Annotated[str | None, flag("NAME|module:Name", "the scenario's")] = None
-    """Flock model."""
     who: Annotated[Literal["shepherds", "sheep"], flag("shepherds|sheep")] = "shepherds"
     """Whose places are mapped."""
     frame: Annotated[Literal["flock", "world"], flag("flock|world")] = "flock"
@@ -163,7 +136,7 @@ class Learning:
     """Where to; its ending says what: png, svg or pdf."""
 
 
-LEAST = {"flocks": 1, "cohesion": 1, "shepherds": 0, "sheep": 1, "seed": 0}
+LEAST = {**WORLD_LEAST, "seed": 0}
 
 
 def main(argv: Sequence[str]) -> int:
@@ -261,26 +234,6 @@ def draw_measures(options: Measures) -> bytes:
     return figures.draw_measures(summary, label, title, metrics, about, kind_of_file(options.out))
 
 
-def one_point(options: Trajectories | Heatmap, controllers: Sequence[str]) -> list[Point]:
-    """A point a controller.
-
-    Raises:
-        SettingsError: something is unknown or impossible.
-        ControllerError: an object given as controller is none.
-    """
-    at_least({name: getattr(options, name) for name in LEAST}, LEAST)
-    given = {name: getattr(options, name) for name in ("flocks", "cohesion", "shepherds")}
-    lists: dict[str, Any] = {name: () if value is None else (value,) for name, value in given.items()}
-    return points(
-        controllers=controllers,
-        scenario=options.scenario,
-        sheep=options.sheep,
-        body=options.body,
-        flock=options.flock,
-        **lists,
-    )
-
-
 def draw_trajectories(options: Trajectories) -> bytes:
     """The figure of one episode.
 
@@ -292,7 +245,8 @@ def draw_trajectories(options: Trajectories) -> bytes:
     from . import path_figures
     from .paths import walks
 
-    (point,) = one_point(options, [options.controller])
+    at_least({name: getattr(options, name) for name in LEAST}, LEAST)
+    point = options.point(options.controller)
     place(point, [options.seed])
     try:
         walk = walks(point, options.seed)
@@ -315,7 +269,8 @@ def draw_heatmap(options: Heatmap) -> bytes:
     from .paths import maps
 
     at_least({"trials": options.trials, "workers": options.workers}, {"trials": 1, "workers": 1})
-    found = one_point(options, options.controllers)
+    at_least({name: getattr(options, name) for name in LEAST}, LEAST)
+    found = [options.point(name) for name in dict.fromkeys(options.controllers)]
     if not found:
         raise SettingsError("controllers: needs at least one value")
     seeds = [trial_seed(options.seed, trial) for trial in range(options.trials)]

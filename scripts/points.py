@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from shepherd_phys import __version__
 from shepherd_phys.campaign import Outcome, Task, remove, settings_hash, write_csv, write_parquet
@@ -32,6 +32,7 @@ from shepherd_phys.settings import SettingsError, kind_of
 from shepherd_phys.workers import explain
 from shepherd_phys.world import World
 
+from .command import flag
 from .own import find_kinds, find_scenario, imported, of_kinds, source_hash, take_step
 
 KINDS: dict[str, type] = {
@@ -145,6 +146,49 @@ def points(
             varied["shepherds"] = _team(base, n_shepherds, default)
         found.append(Point(name, shown, base.but(**varied)))
     return found
+
+
+LEAST = {"flocks": 1, "cohesion": 1, "shepherds": 0, "sheep": 1}
+"""Of the numbers of `WorldFlags`."""
+
+
+@dataclass(frozen=True)
+class WorldFlags:
+    """The flags of a command that plays in one world, with evaluate's names."""
+
+    flocks: Annotated[int | None, flag("K", "the scenario's")] = None
+    """Number of flocks."""
+    cohesion: Annotated[int | None, flag("N", "the scenario's")] = None
+    """Number of neighbours that attract a sheep."""
+    shepherds: Annotated[int | None, flag("M", "the scenario's")] = None
+    """Number of shepherds."""
+    sheep: Annotated[int | None, flag("N", "the scenario's")] = None
+    """Number of sheep."""
+    scenario: Annotated[str, flag("NAME|FILE|module:Name")] = "paper"
+    """A preset's name, a TOML file, or module:Name of a scenario of your own."""
+    body: Annotated[str | None, flag("NAME|module:Name", "the scenario's")] = None
+    """Body of every shepherd."""
+    flock: Annotated[str | None, flag("NAME|module:Name", "the scenario's")] = None
+    """Flock model."""
+
+    def point(self, controller: str) -> Point:
+        """A controller in this world.
+
+        Raises:
+            SettingsError: something is unknown or impossible.
+            ControllerError: an object given as controller is none.
+        """
+        numbers = {"flocks": self.flocks, "cohesion": self.cohesion, "shepherds": self.shepherds}
+        lists: dict[str, Any] = {name: () if value is None else (value,) for name, value in numbers.items()}
+        (point,) = points(
+            controllers=[controller],
+            scenario=self.scenario,
+            sheep=self.sheep,
+            body=self.body,
+            flock=self.flock,
+            **lists,
+        )
+        return point
 
 
 def tasks(points: Iterable[Point], seeds: Sequence[int]) -> list[Task]:

@@ -116,7 +116,7 @@ def prepare(options: Train, given: set[str], kinds: Mapping[str, type[Any]]) -> 
     Args:
         options: the command line.
         given: which of them were.
-        kinds: classes of the shepherds' bodies and of the flock model, see `shepherd_phys.scripts.points.find_kinds`.
+        kinds: classes of the shepherds' bodies and of the flock model, see `shepherd_phys.scripts.own.find_kinds`.
 
     Raises:
         SettingsError: the folder holds another run, or none to resume; or the preset is impossible.

@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import tyro
@@ -27,7 +27,8 @@ from shepherd_phys.window import DisplayError, Window
 
 from .command import at_least, fail, flag, parsed
 from .player import SPEEDS, Player
-from .points import points
+from .points import LEAST as WORLD_LEAST
+from .points import WorldFlags
 from .sources import Live, Recorded, Source
 
 PROG = "shepherd-phys watch"
@@ -36,7 +37,7 @@ MAX_VIEWS = 2
 
 
 @dataclass(frozen=True)
-class Watch:
+class Watch(WorldFlags):
     """Watch controllers at work, live in a window, or write a film of them; H in the window shows the keys.
 
     Episodes are those of evaluate: trial 0 of --seed first. In the window, arrow keys, W A S D or the mouse take a
@@ -45,20 +46,6 @@ class Watch:
 
     controllers: Annotated[tuple[str, ...], flag("A [B]")] = ("collie",)
     """A name, a policy's .json file, or module:Name of your own; two of them play the same episode side by side."""
-    scenario: Annotated[str, flag("NAME|FILE|module:Name")] = "paper"
-    """A preset's name, a TOML file, or module:Name of a scenario of your own."""
-    flocks: Annotated[int | None, flag("K", "the scenario's")] = None
-    """Number of flocks."""
-    cohesion: Annotated[int | None, flag("N", "the scenario's")] = None
-    """Number of neighbours that attract a sheep."""
-    shepherds: Annotated[int | None, flag("M", "the scenario's")] = None
-    """Number of shepherds."""
-    sheep: Annotated[int | None, flag("N", "the scenario's")] = None
-    """Number of sheep."""
-    body: Annotated[str | None, flag("NAME|module:Name", "the scenario's")] = None
-    """Body of every shepherd."""
-    flock: Annotated[str | None, flag("NAME|module:Name", "the scenario's")] = None
-    """Flock model."""
     seed: Annotated[int, flag("S")] = 20_000
     """Root seed, as evaluate's."""
     trial: Annotated[int, flag("I")] = 0
@@ -92,7 +79,7 @@ OF_LIVE = ("controllers", "scenario", "flocks", "cohesion", "shepherds", "sheep"
 PAGE = ".html"
 OF_PICTURES = ("steps", "speed", "fps", "size", "camera", "dark")
 """What a page has not."""
-LEAST = {"flocks": 1, "cohesion": 1, "shepherds": 0, "sheep": 1, "seed": 0, "trial": 0, "steps": 1, "fps": 1}
+LEAST = {**WORLD_LEAST, "seed": 0, "trial": 0, "steps": 1, "fps": 1}
 
 
 def main(argv: Sequence[str]) -> int:
@@ -182,22 +169,8 @@ def live(options: Watch) -> list[Source]:
         SettingsError: a name is unknown, or a world cannot be made.
         ControllerError: an object given as controller is none.
     """
-    lists: dict[str, Any] = {
-        name: () if value is None else (value,)
-        for name, value in ((name, getattr(options, name)) for name in ("flocks", "cohesion", "shepherds"))
-    }
-    sources: list[Source] = []
-    for name in options.controllers:  # the same one twice is fine: one of them can be led
-        (point,) = points(
-            controllers=[name],
-            scenario=options.scenario,
-            sheep=options.sheep,
-            body=options.body,
-            flock=options.flock,
-            **lists,
-        )
-        sources.append(Live(point, options.seed, options.trial, options.rewards))
-    return sources
+    # the same one twice is fine: one of them can be led
+    return [Live(options.point(name), options.seed, options.trial, options.rewards) for name in options.controllers]
 
 
 def make_player(sources: Sequence[Source], options: Watch) -> Player:
