@@ -71,7 +71,7 @@ def page(replay: Replay) -> str:
         "result": html.escape(_result(replay)),
         "result_class": "success" if replay.success else "short",
         "bokeh": Resources(mode="inline", components=["bokeh"], minified=True).render_js(),
-        "plots": _script(plots),
+        "plots": _script(_numbered(plots, {})),
         "episode": _script(_episode(replay, field)),
     }
     template = TEMPLATE.read_text(encoding="utf-8")
@@ -96,6 +96,18 @@ def _result(replay: Replay) -> str:
     path = f", {walked.mean():.0f} m walked by a shepherd" if len(walked) else ""
     seconds = replay.n_steps * replay.scenario.control_dt
     return f"{there} of {replay.n_sheep} sheep in the goal after {seconds:.0f} s{path}"
+
+
+def _numbered(data: Any, numbers: dict[str, str]) -> Any:
+    """bokeh's JSON with its models numbered from 1: bokeh counts on through a process, and a replay has one page."""
+    if isinstance(data, dict):
+        return {
+            key: numbers.setdefault(value, f"p{len(numbers) + 1}")
+            if key in ("id", "root_id") and isinstance(value, str)
+            else _numbered(value, numbers)
+            for key, value in data.items()
+        }
+    return [_numbered(value, numbers) for value in data] if isinstance(data, list) else data
 
 
 def _script(data: Any) -> str:

@@ -72,6 +72,10 @@ def test_a_page_loads_nothing_and_runs_no_name(replay):
     assert "url(" not in style and "@import" not in style
 
 
+def test_a_replay_has_one_page_however_many_were_made_before(replay):
+    assert page(replay) == page(replay)
+
+
 def test_a_page_of_the_papers_episode_has_a_bounded_size(tmp_path):
     env = ShepherdingEnv("paper", rewards={"zero": (1.0, lambda *_: 0.125)}, lidar=None)
     _, replay = recorded(Idle(), env, 1)
