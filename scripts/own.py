@@ -7,7 +7,7 @@ import importlib
 import inspect
 import os
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -73,13 +73,30 @@ def of_kinds(base: Scenario, kinds: Mapping[str, type[Any]]) -> tuple[Scenario, 
     return base, default
 
 
-def take_step(world: World) -> None:
-    """Let the shepherds of a world that was reset ask for top speed, for one control step.
+def own_classes(scenario: Scenario) -> list[Any]:
+    """The classes and functions, not of the library, that a scenario is made of: what reads it back is given them."""
+    things = [*scenario.shepherds, *scenario.sheep_kinds, scenario.flock, *scenario.obstacles, scenario.layout]
+    made_by = [thing if inspect.isroutine(thing) else type(thing) for thing in things]
+    return [maker for maker in dict.fromkeys(made_by) if ":" in kind_of(maker)]
+
+
+def try_out(world: World, seeds: Sequence[int]) -> None:
+    """Find out before anything is made what a user's own classes get wrong.
+
+    The world is placed on the first of the seeds on which it can be; then all shepherds ask for top speed for one
+    control step.
 
     Raises:
-        SettingsError: a body or the flock model failed.
+        SettingsError: it cannot be placed on any, or a class failed.
     """
     try:
+        for i, seed in enumerate(seeds, start=1):
+            try:
+                world.reset(seed)
+                break
+            except SettingsError:
+                if i == len(seeds):
+                    raise
         world.step(np.tile([1.0, 0.0], (world.scenario.n_shepherds, 1)))
     except SettingsError:
         raise

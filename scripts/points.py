@@ -33,7 +33,7 @@ from shepherd_phys.workers import explain
 from shepherd_phys.world import World
 
 from .command import flag
-from .own import find_kinds, find_scenario, imported, of_kinds, source_hash, take_step
+from .own import find_kinds, find_scenario, imported, of_kinds, source_hash, try_out
 
 KINDS: dict[str, type] = {
     **dict.fromkeys(COLUMNS, float),
@@ -205,20 +205,12 @@ def tasks(points: Iterable[Point], seeds: Sequence[int]) -> list[Task]:
 
 
 def place(point: Point, seeds: Sequence[int]) -> None:
-    """Place a point's world on one of the seeds, and make a step: bodies and flock models may be a user's own.
+    """Place a point's world on one of the seeds, and make a step: what it holds may be a user's own.
 
     Raises:
         SettingsError: it cannot be placed on any, or not make a step.
     """
-    world = World(point.scenario)
-    for i, seed in enumerate(seeds, start=1):
-        try:
-            world.reset(seed)
-            break
-        except SettingsError:
-            if i == len(seeds):
-                raise
-    take_step(world)
+    try_out(World(point.scenario), seeds)
 
 
 def episode(point: Point, seed: int) -> dict[str, Any]:

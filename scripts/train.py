@@ -23,7 +23,7 @@ from shepherd_phys.settings import SettingsError, kind_of
 from shepherd_phys.world import World
 
 from .command import LOG_SECONDS, at_least, clock, cpu_count, fail, flag, parsed
-from .own import find_kinds, find_scenario, of_kinds, take_step
+from .own import find_kinds, find_scenario, of_kinds, own_classes, try_out
 
 PROG = "shepherd-phys train"
 LIBRARIES = ("torch", "stable_baselines3", "tensorboard")
@@ -63,7 +63,7 @@ class Train:
     out: Annotated[Path | None, flag("DIR", "runs/PRESET-REWARD-SEED..")] = None
     """Folder of the run."""
     resume: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Go on with the run in --out; classes of your own (--body, --flock) are given again."""
+    """Go on with the run in --out; classes of your own (--body, --flock, --scenario) are given again."""
 
 
 FROM_PRESET = ("reward", "seed", "budget", "init")
@@ -95,7 +95,7 @@ def main(argv: Sequence[str]) -> int:
     )
     with progress_bar() as report:
         try:
-            best = train(folder, options.workers, report, preset=preset, classes=kinds.values())
+            best = train(folder, options.workers, report, preset=preset, classes=handed(options, kinds))
         except SettingsError as error:
             return fail(PROG, error, 2)
         except (CheckpointError, TrainingError, ValidationError, WorkerError, WorkersError, OSError) as error:
@@ -126,11 +126,12 @@ def prepare(options: Train, given: set[str], kinds: Mapping[str, type[Any]]) -> 
             raise SettingsError("--resume needs --out, the folder of the run")
         if not (options.out / PRESET).is_file():
             raise SettingsError(f"{options.out}: holds no run to resume (no {PRESET})")
-        preset = Preset.from_toml(options.out / PRESET, kinds.values())
-        wanted = load_preset(options.preset, kinds.values()) if "preset" in given else preset
+        classes = handed(options, kinds)
+        preset = Preset.from_toml(options.out / PRESET, classes)
+        wanted = load_preset(options.preset, classes) if "preset" in given else preset
         changed = asked(wanted.but(budget=preset.budget), options, given, kinds)
         try:
-            agree(options.out, changed, kinds.values())
+            agree(options.out, changed, classes)
         except SettingsError as error:
             raise SettingsError(f"{error}; --resume needs none but --out") from None
         World(changed.scenario)  # finds out what was not handed over
@@ -143,11 +144,15 @@ def prepare(options: Train, given: set[str], kinds: Mapping[str, type[Any]]) -> 
     # before a folder is made that the next attempt would find
     preset.start()
     if preset.scenario.has_obstacles or kinds or options.scenario is not None:
-        world = World(preset.scenario)
-        world.reset(preset.validation.seed)  # whether there is room for obstacles
-        take_step(world)
+        try_out(World(preset.scenario), [preset.validation.seed])  # is there room for obstacles, do classes fail
     begin(folder, preset)
     return folder, preset
+
+
+def handed(options: Train, kinds: Mapping[str, type[Any]]) -> list[Any]:
+    """The classes of a user's own that the command line hands over: of bodies and flock models, and a scenario's."""
+    own = [] if options.scenario is None else own_classes(find_scenario(options.scenario, kinds.values()))
+    return [*kinds.values(), *own]
 
 
 def asked(preset: Preset, options: Train, given: set[str], kinds: Mapping[str, type[Any]]) -> Preset:
@@ -166,7 +171,14 @@ def asked(preset: Preset, options: Train, given: set[str], kinds: Mapping[str, t
         if not isinstance(layout, Scattered):
             raise SettingsError(f"--obstacles, --density: the scenario has a layout of its own, {kind_of(layout)}")
         layout = layout.but(count=options.obstacles, density=options.density)
-        preset = preset.but(scenario=preset.scenario.but(layout=layout))
+        drawn = preset.density
+        if drawn is not None and options.density is None:
+            raise SettingsError(
+                f"--obstacles: the preset draws another density for each episode, {drawn[0]:g} to {drawn[1]:g}; "
+                "--density sets it"
+            )
+        span = None if drawn is None else (options.density, options.density)  # what is drawn is no other then
+        preset = preset.but(scenario=preset.scenario.but(layout=layout), density=span)
     return preset.but(scenario=of_kinds(preset.scenario, kinds)[0]) if kinds else preset
 
 

@@ -315,6 +315,11 @@ def built(body: Body, who: str) -> tuple[pymunk.Body, list[pymunk.Shape], float]
     for shape in shapes:
         if shape.body is not made:
             raise SettingsError(f"{name}.build: {type(shape).__name__} belongs to another body")
+        if shape.sensor:
+            raise SettingsError(
+                f"{name}.build: a {type(shape).__name__} is a sensor, which touches nothing and no beam sees; "
+                "a body that flies has flies = True"
+            )
         shape.friction = 0.0
         reach = max(reach, _reach(shape))
     if not (math.isfinite(reach) and reach > 0):

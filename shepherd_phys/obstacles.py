@@ -6,7 +6,9 @@ A user adds one by writing a class with a ``shapes`` method.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Annotated, Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -22,6 +24,8 @@ Point = tuple[float, float]
 MIN_THICKNESS = 0.1
 """[m]. At the default substep nothing gets through a wall this thick; thinner ones are refused."""
 
+ROUNDING = 1e-9
+"""[m] by which a corner may lie off the place that was meant."""
 
 Side = Annotated[float, Field(ge=MIN_THICKNESS)]
 
@@ -86,15 +90,20 @@ def _convex(vertices: tuple[Point, ...]) -> tuple[Point, ...]:
         )
     if total > 2.5 * math.pi:
         raise ValueError("the corners must go once round a convex polygon")
-    width = math.inf
-    for i in range(n):
-        (ax, ay), (bx, by) = ordered[i - 1], ordered[i]
-        nx, ny = (ay - by), (bx - ax)
-        length = math.hypot(nx, ny)
-        width = min(width, max((x - ax) * nx + (y - ay) * ny for x, y in ordered) / length)
+    width = _width(ordered)
     if width < MIN_THICKNESS:
         raise ValueError(f"is {width:.3g} m thick at its thinnest; at least {MIN_THICKNESS} m is allowed")
     return ordered
+
+
+def _width(corners: Sequence[Point]) -> float:
+    """Of a convex polygon at its thinnest [m]: the least, over its edges, of how far the furthest corner is."""
+    least = math.inf
+    for (ax, ay), (bx, by) in pairwise([corners[-1], *corners]):
+        nx, ny = (ay - by), (bx - ax)
+        length = math.hypot(nx, ny) or math.inf  # corners in one place: no width at all
+        least = min(least, max(abs((x - ax) * nx + (y - ay) * ny) for x, y in corners) / length)
+    return least
 
 
 @settings
@@ -185,11 +194,14 @@ def solid(obstacle: Obstacle, index: int, body: pymunk.Body) -> list[pymunk.Shap
     if not shapes:
         raise SettingsError(f"{name}.shapes: gave no shape")
     for shape in shapes:
-        if not isinstance(shape, pymunk.Poly) and not shape.radius >= MIN_THICKNESS / 2:
+        thickness = 2 * shape.radius + (_width(shape.get_vertices()) if isinstance(shape, pymunk.Poly) else 0.0)
+        if not thickness >= MIN_THICKNESS - ROUNDING:
             raise SettingsError(
                 f"{name}.shapes: a {type(shape).__name__} must be at least {MIN_THICKNESS} m thick, or bodies get "
-                f"through (given: radius {shape.radius} m)"
+                f"through (given: {thickness:.3g} m)"
             )
+        if shape.sensor:
+            raise SettingsError(f"{name}.shapes: a {type(shape).__name__} is a sensor, which stops nobody")
         if shape.body is not body:
             raise SettingsError(f"{name}.shapes: {type(shape).__name__} is not attached to the body it was given")
         box = shape.cache_bb()

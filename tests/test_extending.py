@@ -13,8 +13,10 @@ from test_docs import ROOT, blocks
 
 from shepherd_phys.controllers import load_policy
 from shepherd_phys.learning.preset import Preset
+from shepherd_phys.scripts.evaluate import main as evaluate
 from shepherd_phys.scripts.train import main as train
 from shepherd_phys.settings import Foreign
+from shepherd_phys.world import World
 
 PAGE = ROOT / "docs" / "extending.md"
 MARK = "# my_file.py\n"
@@ -95,6 +97,22 @@ def test_a_policy_for_a_users_body_is_trained_and_played_from_the_command_line(f
     assert {row["controller"] for row in rows()} == {"runs/hexapod/best.json", "idle"}
 
 
+def test_a_policy_is_trained_in_a_scenario_of_a_users_own_classes_and_goes_on(folder, capsys):
+    Path("mine.py").write_text(
+        "from my_file import *\n"
+        "STREWN = FIELD.but(n_sheep=6, n_steps=60, layout=Crosses(2))\n"  # every class of the guide is in it
+    )
+    own = ["--scenario", "mine:STREWN", "--out", "runs/strewn", "--workers", "1"]
+    assert train(["--preset", "quick.toml", *own]) == 0
+    assert train(["--resume", "--budget", "4800", "--out", "runs/strewn", "--workers", "1"]) == 2
+    assert "is a class of somebody's own and was not handed over" in capsys.readouterr().err
+    assert train(["--resume", "--budget", "4800", *own]) == 0
+    policy = load_policy("runs/strewn/policy.json")
+    assert policy.spec.training["shepherd_steps"] > 4_000
+    assert policy.spec.lidar.channels[-1] == "obstacles"
+    sys.modules.pop("mine")
+
+
 def test_the_guides_preset_is_one(folder):
     preset = Preset.from_dict(QUICK)
     assert (preset.n_slots, preset.budget) == (48, 50_000)
@@ -102,6 +120,7 @@ def test_the_guides_preset_is_one(folder):
 
 BROKEN = """
 from shepherd_phys.bodies import Disc
+from shepherd_phys.scenario import SCENARIOS
 
 class Stone:
     max_speed = 1.0
@@ -109,9 +128,24 @@ class Stuck(Disc):
     def follow(self, pose, wanted): return wanted, 0.0
 class Ghost(Disc):
     def build(self): return None
+class Bomb(Disc):
+    def build(self): raise OSError("no parts")
+class Buoy(Disc):
+    def build(self):
+        body, shapes = Disc.build(self)
+        shapes[0].sensor = True
+        return body, shapes
 class Deaf:
     def hear(self): ...
+class Secretive:
+    def __init__(self): self.mood = 3
+    def velocities(self, state, rng): return 0.0 * state.sheep_pos
+class Sea:
+    def shapes(self, body): raise OSError("no shore")
+def fog(rng, site): raise OSError("no light")
 number = 3
+FLOODED = SCENARIOS["small"].but(obstacles=(Sea(),))
+FOGGY = SCENARIOS["small"].but(layout=fog)
 """
 
 
@@ -121,6 +155,11 @@ number = 3
         ("--body my_file:Stone", "body: my_file:Stone: lacks build, follow"),
         ("--body my_file:Stuck", "TypeError: Stuck.follow() takes 3 positional arguments but 4 were given"),
         ("--body my_file:Ghost", "shepherd 0 (my_file:Ghost).build: needs a pymunk.Body and a list of its shapes"),
+        ("--body my_file:Bomb", "OSError: no parts (my_file.py:"),
+        ("--body my_file:Buoy", "(my_file:Buoy).build: a Circle is a sensor, which touches nothing and no beam sees"),
+        ("--scenario my_file:FLOODED", "OSError: no shore (my_file.py:"),
+        ("--scenario my_file:FOGGY", "OSError: no light (my_file.py:"),
+        ("--flock my_file:Secretive", "my_file:Secretive: cannot be written, because it does not say"),
         ("--body my_file:number", "body: my_file:number: needs a class (it is a int)"),
         ("--body my_file:Nobody", "body: my_file:Nobody: module 'my_file' has no 'Nobody'"),
         ("--body Tank", "body: 'Tank' is unknown; there are DifferentialDrive, Disc, Flyer"),
@@ -133,6 +172,30 @@ def test_train_tells_in_one_line_what_a_class_lacks_and_makes_no_folder(flags, m
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("shepherd-phys train: ") and message in line
     assert not Path("runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ("--body my_file:Bomb", "OSError: no parts (my_file.py:"),
+        ("--scenario my_file:FLOODED", "OSError: no shore (my_file.py:"),
+        ("--scenario my_file:FOGGY", "OSError: no light (my_file.py:"),
+    ],
+)
+def test_evaluate_tells_in_one_line_what_fails_at_a_reset(flags, message, folder, capsys):
+    Path("my_file.py").write_text(BROKEN)
+    assert evaluate(["--controllers", "idle", "--out", "results", *flags.split()]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("shepherd-phys evaluate: ") and message in line
+    assert not Path("results").exists()
+
+
+def test_the_guides_layout_ends_where_there_is_no_room(folder):
+    sys.path.append(str(folder))
+    from my_file import CROSSED, Crosses
+
+    state = World(CROSSED.but(layout=Crosses(count=10_000))).reset(0)
+    assert 4 < len(state.obstacles) < 200
 
 
 def test_a_preset_with_neighbours_to_draw_refuses_boids_in_one_line(folder, capsys):

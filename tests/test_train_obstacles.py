@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from shepherd_phys.layouts import Fenced, Scattered
@@ -43,11 +44,20 @@ def test_a_scenario_says_where_its_flocks_are():
     assert preset.draw().base.flock_distance == (14.0, 20.0)
 
 
+def test_a_density_that_is_asked_for_is_drawn_instead_of_the_presets():
+    preset = asked(load_preset("collie-obstacles"), *parsed(Train, "train", ["--density", "0.03"]), {})
+    draw, rng = preset.draw(), np.random.default_rng(0)
+    layouts = [draw(rng, 0).layout for _ in range(30)]
+    assert {layout.density for layout in layouts if isinstance(layout, Scattered)} == {0.03}
+    assert preset.scenario.layout == Scattered(density=0.03)  # in which it is validated
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         ("--obstacles 3 --density 0.1", "--obstacles and --density: both say how many obstacles there are"),
         ("--scenario fence --obstacles 3", "--obstacles, --density: the scenario has a layout of its own, Fenced"),
+        ("--preset collie-obstacles --obstacles 3", "--obstacles: the preset draws another density for each episode"),
         ("--obstacles -1", "obstacles: -1 is impossible; it must be at least 0"),
         ("--obstacles many", "--obstacles takes a whole number"),
         ("--density 0.9", "Scattered.density: Input should be less than or equal to 0.5 (given: 0.9)"),

@@ -450,9 +450,24 @@ def test_obstacles_that_give_something_else_or_too_thin_shapes_are_named():
     for make in (lambda b: None, lambda b: pymunk.Circle(b, 1.0), lambda b: ["wall"]):
         with pytest.raises(SettingsError, match=r"obstacles\[0\] .*Odd.*shapes: needs a list of pymunk shapes"):
             lone(obstacles=(Odd(make),)).reset(0)
-    for make in (lambda b: [pymunk.Segment(b, (9, 0), (9, 1), 0.0)], lambda b: [pymunk.Circle(b, -1.0)]):
+    for make in (
+        lambda b: [pymunk.Segment(b, (9, 0), (9, 1), 0.0)],
+        lambda b: [pymunk.Circle(b, -1.0)],
+        lambda b: [pymunk.Poly(b, [(9, 9), (12, 9), (12, 9.05), (9, 9.05)], radius=0.02)],
+        lambda b: [pymunk.Poly(b, [(9, 9), (12, 9)])],
+        lambda b: [pymunk.Poly(b, [(9, 9), (9, 9), (9, 9)])],
+    ):
         with pytest.raises(SettingsError, match="must be at least 0.1 m thick"):
             lone(obstacles=(Odd(make),)).reset(0)
+    lone(obstacles=(Odd(lambda b: [pymunk.Poly(b, [(9, 9), (12, 9), (12, 9.05), (9, 9.05)], radius=0.025)]),)).reset(0)
+
+    def sensor(body):
+        shape = pymunk.Circle(body, 1.0)
+        shape.sensor = True
+        return [shape]
+
+    with pytest.raises(SettingsError, match="a Circle is a sensor, which stops nobody"):
+        lone(obstacles=(Odd(sensor),)).reset(0)
 
 
 def test_the_space_may_be_looked_at_but_bodies_may_not_be_added():

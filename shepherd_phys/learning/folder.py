@@ -44,9 +44,10 @@ def begin(folder: Path, preset: Preset) -> None:
     """Make the folder of a new run, with its preset.
 
     Raises:
-        SettingsError: it holds a run already, or cannot be made.
+        SettingsError: it holds a run already, or cannot be made; or the preset cannot be written.
     """
     _refuse_a_run(folder)
+    preset.to_dict()  # refuses what cannot be written before there is a folder
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
