@@ -15,9 +15,9 @@ the whole team. N sheep, T steps of an episode, P shepherds.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import cached_property
-from typing import Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import numba
 import numpy as np
@@ -25,7 +25,7 @@ from pydantic import Field
 
 from shepherd_phys.lidar import CHANNELS, Lidar, Scan
 from shepherd_phys.scenario import SUCCESS_FRACTION, Scenario
-from shepherd_phys.settings import Settings, SettingsError, settings
+from shepherd_phys.settings import Foreign, Settings, SettingsError, handed_over, settings, tagged, untagged
 from shepherd_phys.state import Floats, WorldState
 from shepherd_phys.world import SHEEP_SETS, NonFiniteError
 
@@ -172,6 +172,8 @@ WILD: dict[str, tuple[float, Term]] = {**ORIGINAL, "occlude": (0.1, Occlusion(sh
 """The paper's "Wild Sheep"."""
 SCHEMES: dict[str, Scheme] = {"original": ORIGINAL, "any": ANY, "wild": WILD}
 """By name, for ``gymnasium.make`` and the command line."""
+TERMS: dict[str, type[Any]] = {term.__name__: term for term in (Occupancy, Distance, Occlusion, Effort, Gathered)}
+"""The library's terms by name, for files."""
 
 
 def checked(rewards: Scheme | str) -> Scheme:
@@ -191,10 +193,36 @@ def checked(rewards: Scheme | str) -> Scheme:
             f"rewards: needs a scheme's name or a mapping name -> (weight, term) (given: {rewards!r})"
         ) from None
     for name, (weight, term) in scheme.items():
+        if isinstance(term, Foreign):
+            raise term.missing()
         if not callable(term) or not np.isfinite(weight):
             raise SettingsError(
                 f"rewards[{name!r}]: needs a finite weight and a callable term (given: {weight}, {term!r})"
             )
+    return scheme
+
+
+def to_table(scheme: Scheme) -> dict[str, dict[str, Any]]:
+    """A scheme as plain data: name -> ``weight`` and ``term``.
+
+    Raises:
+        SettingsError: a term does not tell its parameters.
+    """
+    return {name: {"weight": weight, "term": tagged(term)} for name, (weight, term) in scheme.items()}
+
+
+def from_table(table: Mapping[str, Any], classes: Iterable[Any], where: str) -> dict[str, tuple[float, Any]]:
+    """The scheme that `to_table` wrote; a term that is a user's own and not among ``classes`` is a `Foreign`.
+
+    Raises:
+        SettingsError: it is none; ``where`` is the name of the field.
+    """
+    known = TERMS | handed_over(classes)
+    scheme = {}
+    for name, row in table.items():
+        if not isinstance(row, Mapping) or set(row) != {"weight", "term"}:
+            raise SettingsError(f"{where}.{name}: needs a table with weight and term (given: {row!r})")
+        scheme[name] = (row["weight"], untagged(row["term"], known, f"{where}.{name}.term"))
     return scheme
 
 

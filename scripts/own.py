@@ -14,7 +14,9 @@ from typing import Any
 import numpy as np
 
 from shepherd_phys.bodies import BODIES, Body, Disc
+from shepherd_phys.envs.rewards import Scheme, checked, earned, scans_for
 from shepherd_phys.flock import FLOCKS, FlockModel
+from shepherd_phys.lidar import Lidar
 from shepherd_phys.scenario import Scenario, load_scenario
 from shepherd_phys.settings import SettingsError, kind_of
 from shepherd_phys.workers import explain
@@ -73,18 +75,47 @@ def of_kinds(base: Scenario, kinds: Mapping[str, type[Any]]) -> tuple[Scenario, 
     return base, default
 
 
-def own_classes(scenario: Scenario) -> list[Any]:
-    """The classes and functions, not of the library, that a scenario is made of: what reads it back is given them."""
-    things = [*scenario.shepherds, *scenario.sheep_kinds, scenario.flock, *scenario.obstacles, scenario.layout]
-    made_by = [thing if inspect.isroutine(thing) else type(thing) for thing in things]
+def find_reward(name: str) -> Scheme | str:
+    """A scheme's name, or the scheme ``module:Name`` of a user's own.
+
+    Raises:
+        SettingsError: it is no scheme.
+    """
+    if ":" not in name:
+        return name
+    own = imported(name, "reward")
+    if not isinstance(own, Mapping):
+        raise SettingsError(
+            f"reward: {name}: needs a scheme, a dict of name -> (weight, term) (it is a {type(own).__name__})"
+        )
+    try:
+        return checked(own)
+    except SettingsError as error:
+        raise SettingsError(f"reward: {name}: {error}") from None
+
+
+def own_classes(scenario: Scenario | None, reward: Scheme | str | None) -> list[Any]:
+    """The classes and functions, not of the library, of a scenario and a reward: what reads them back is given them."""
+    things: list[Any] = []
+    if scenario is not None:
+        things += [*scenario.shepherds, *scenario.sheep_kinds, scenario.flock, *scenario.obstacles, scenario.layout]
+    if isinstance(reward, Mapping):
+        things += [term for _, term in reward.values()]
+    made_by = [thing if inspect.isroutine(thing) else type(thing) for thing in things if thing is not None]
     return [maker for maker in dict.fromkeys(made_by) if ":" in kind_of(maker)]
 
 
-def try_out(world: World, seeds: Sequence[int]) -> None:
+def try_out(world: World, seeds: Sequence[int], scheme: Scheme | None = None, lidar: Lidar | None = None) -> None:
     """Find out before anything is made what a user's own classes get wrong.
 
     The world is placed on the first of the seeds on which it can be; then all shepherds ask for top speed for one
-    control step.
+    control step, for which they are rewarded.
+
+    Args:
+        world: of the scenario.
+        seeds: not none.
+        scheme: of the rewards, where some are given.
+        lidar: with which they are given.
 
     Raises:
         SettingsError: it cannot be placed on any, or a class failed.
@@ -97,7 +128,12 @@ def try_out(world: World, seeds: Sequence[int]) -> None:
             except SettingsError:
                 if i == len(seeds):
                     raise
-        world.step(np.tile([1.0, 0.0], (world.scenario.n_shepherds, 1)))
+        before = world.state
+        after = world.step(np.tile([1.0, 0.0], (world.scenario.n_shepherds, 1)))
+        if scheme is not None:
+            scanned, sets = scans_for(scheme, lidar)
+            scan = None if scanned is None else world.scan(scanned, sets)
+            earned(scheme, before, after, scan, world.scenario)
     except SettingsError:
         raise
     except Exception as error:

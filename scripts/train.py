@@ -23,7 +23,7 @@ from shepherd_phys.settings import SettingsError, kind_of
 from shepherd_phys.world import World
 
 from .command import LOG_SECONDS, at_least, clock, cpu_count, fail, flag, parsed
-from .own import find_kinds, find_scenario, of_kinds, own_classes, try_out
+from .own import find_kinds, find_reward, find_scenario, of_kinds, own_classes, try_out
 
 PROG = "shepherd-phys train"
 LIBRARIES = ("torch", "stable_baselines3", "tensorboard")
@@ -40,8 +40,8 @@ class Train:
 
     preset: Annotated[str, flag("NAME|FILE")] = "fast"
     """How to train: fast, paper or collie, or a TOML file of your own."""
-    reward: Annotated[str | None, flag("NAME", "the preset's")] = None
-    """Reward scheme."""
+    reward: Annotated[str | None, flag("NAME|module:Name", "the preset's")] = None
+    """Reward scheme: original, any, wild, or a dict name -> (weight, term) of your own."""
     seed: Annotated[int | None, flag("S", "the preset's")] = None
     """Root of everything random; 1,000,000 and up is meant for training."""
     budget: Annotated[int | None, flag("N", "the preset's")] = None
@@ -63,11 +63,11 @@ class Train:
     out: Annotated[Path | None, flag("DIR", "runs/PRESET-REWARD-SEED..")] = None
     """Folder of the run."""
     resume: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Go on with the run in --out; classes of your own (--body, --flock, --scenario) are given again."""
+    """Go on with the run in --out; what is your own (--body, --flock, --scenario, --reward) is given again."""
 
 
-FROM_PRESET = ("reward", "seed", "budget", "init")
-"""Flags that replace a field of the preset."""
+FROM_PRESET = ("seed", "budget", "init")
+"""Flags that replace a field of the preset as they are."""
 
 
 def main(argv: Sequence[str]) -> int:
@@ -135,24 +135,27 @@ def prepare(options: Train, given: set[str], kinds: Mapping[str, type[Any]]) -> 
         except SettingsError as error:
             raise SettingsError(f"{error}; --resume needs none but --out") from None
         World(changed.scenario)  # finds out what was not handed over
+        changed.scheme()
         return options.out, changed  # `train` writes it, once nobody else is at the run
     preset = asked(load_preset(options.preset, kinds.values()), options, given, kinds)
-    words = [Path(options.preset).stem, preset.reward, str(preset.seed)]
+    words = [Path(options.preset).stem, preset.reward_name, str(preset.seed)]
     words += [Path(options.scenario).stem] if options.scenario is not None else []
     words += [f"{name}{getattr(options, name):g}" for name in ("obstacles", "density") if name in given]
     folder = options.out or Path("runs") / "-".join(words)
     # before a folder is made that the next attempt would find
     preset.start()
-    if preset.scenario.has_obstacles or kinds or options.scenario is not None:
-        try_out(World(preset.scenario), [preset.validation.seed])  # is there room for obstacles, do classes fail
+    if preset.scenario.has_obstacles or kinds or options.scenario is not None or not isinstance(preset.reward, str):
+        # is there room for obstacles, does anything of a user's own fail
+        try_out(World(preset.scenario), [preset.validation.seed], preset.scheme(), preset.lidar)
     begin(folder, preset)
     return folder, preset
 
 
 def handed(options: Train, kinds: Mapping[str, type[Any]]) -> list[Any]:
-    """The classes of a user's own that the command line hands over: of bodies and flock models, and a scenario's."""
-    own = [] if options.scenario is None else own_classes(find_scenario(options.scenario, kinds.values()))
-    return [*kinds.values(), *own]
+    """What of a user's own the command line hands over: classes and functions."""
+    scenario = None if options.scenario is None else find_scenario(options.scenario, kinds.values())
+    reward = None if options.reward is None else find_reward(options.reward)
+    return [*kinds.values(), *own_classes(scenario, reward)]
 
 
 def asked(preset: Preset, options: Train, given: set[str], kinds: Mapping[str, type[Any]]) -> Preset:
@@ -162,6 +165,8 @@ def asked(preset: Preset, options: Train, given: set[str], kinds: Mapping[str, t
         SettingsError: a flag's value is impossible, two of them do not go together, or a class lacks something.
     """
     preset = preset.but(**{name: getattr(options, name) for name in FROM_PRESET if name in given})
+    if options.reward is not None:
+        preset = preset.but(reward=find_reward(options.reward))
     if options.scenario is not None:
         preset = preset.but(scenario=find_scenario(options.scenario, kinds.values()), flock_distance=None)
     if options.obstacles is not None and options.density is not None:

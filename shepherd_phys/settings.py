@@ -124,7 +124,8 @@ class Foreign:
         return SettingsError(
             f"{self.kind!r} is a class of somebody's own and was not handed over: in Python, give it with classes=; "
             "on the command line, --body module:Name hands over a body and --flock module:Name a flock model; what has "
-            "an obstacle or a layout of one's own, or several bodies, is itself given as --scenario module:Name"
+            "an obstacle or a layout of one's own, or several bodies, is itself given as --scenario module:Name, and a "
+            "reward of one's own as --reward module:Name"
         )
 
 

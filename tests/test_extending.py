@@ -100,16 +100,22 @@ def test_a_policy_for_a_users_body_is_trained_and_played_from_the_command_line(f
 def test_a_policy_is_trained_in_a_scenario_of_a_users_own_classes_and_goes_on(folder, capsys):
     Path("mine.py").write_text(
         "from my_file import *\n"
-        "STREWN = FIELD.but(n_sheep=6, n_steps=60, layout=Crosses(2))\n"  # every class of the guide is in it
+        "class Lazy:\n"  # no dataclass: two of it are not equal
+        "    def velocities(self, state, rng): return 0.2 * state.sheep_heading\n"
+        "STREWN = FIELD.but(n_sheep=6, n_steps=60, layout=Crosses(2), flock=Lazy())\n"
     )
-    own = ["--scenario", "mine:STREWN", "--out", "runs/strewn", "--workers", "1"]
+    own = ["--scenario", "mine:STREWN", "--reward", "my_file:CALM", "--out", "runs/strewn", "--workers", "1"]
     assert train(["--preset", "quick.toml", *own]) == 0
     assert train(["--resume", "--budget", "4800", "--out", "runs/strewn", "--workers", "1"]) == 2
     assert "is a class of somebody's own and was not handed over" in capsys.readouterr().err
+    assert train(["--resume", "--budget", "4800", "--out", "runs/strewn", "--scenario", "mine:STREWN"]) == 2
+    assert "'my_file:calm' is a class of somebody's own and was not handed over" in capsys.readouterr().err
     assert train(["--resume", "--budget", "4800", *own]) == 0
     policy = load_policy("runs/strewn/policy.json")
     assert policy.spec.training["shepherd_steps"] > 4_000
     assert policy.spec.lidar.channels[-1] == "obstacles"
+    terms = policy.spec.rewards["terms"]
+    assert terms["calm"] == {"weight": -0.05, "term": {"kind": "my_file:calm"}} and len(terms) == 4
     sys.modules.pop("mine")
 
 
@@ -143,6 +149,9 @@ class Secretive:
 class Sea:
     def shapes(self, body): raise OSError("no shore")
 def fog(rng, site): raise OSError("no light")
+def sour(before, after, scan, scenario): raise OSError("no taste")
+SOUR = {"sour": (1.0, sour)}
+BLAND = {"bland": sour}
 number = 3
 FLOODED = SCENARIOS["small"].but(obstacles=(Sea(),))
 FOGGY = SCENARIOS["small"].but(layout=fog)
@@ -160,6 +169,10 @@ FOGGY = SCENARIOS["small"].but(layout=fog)
         ("--scenario my_file:FLOODED", "OSError: no shore (my_file.py:"),
         ("--scenario my_file:FOGGY", "OSError: no light (my_file.py:"),
         ("--flock my_file:Secretive", "my_file:Secretive: cannot be written, because it does not say"),
+        ("--reward my_file:number", "reward: my_file:number: needs a scheme, a dict of name -> (weight, term)"),
+        ("--reward my_file:BLAND", "reward: my_file:BLAND: rewards: needs a scheme's name or a mapping"),
+        ("--reward my_file:SOUR", "OSError: no taste (my_file.py:"),
+        ("--reward sweet", "reward: 'sweet' is not one of original, any, wild"),
         ("--body my_file:number", "body: my_file:number: needs a class (it is a int)"),
         ("--body my_file:Nobody", "body: my_file:Nobody: module 'my_file' has no 'Nobody'"),
         ("--body Tank", "body: 'Tank' is unknown; there are DifferentialDrive, Disc, Flyer"),

@@ -474,3 +474,30 @@ def test_a_policy_that_was_trained_deploys_where_it_was_not(learner):
 
 def test_the_longest_decision_can_be_exported():
     assert spec_of_preset(TINY.but(decision_interval=1000)).action.noise_steps == 1000
+
+
+def test_a_preset_may_have_a_reward_of_its_own(tmp_path):
+    preset = TINY.but(reward={**SCHEMES["wild"], "walk": (-0.5, Effort(team=2))}, alpha=1.0)
+    assert preset.reward_name == "own"
+    assert preset.scheme()["walk"] == (-0.5, Effort(team=2)) and preset.scheme()["occlude"][1].alpha == 1.0
+    preset.to_toml(tmp_path / "p.toml")
+    assert load_preset(tmp_path / "p.toml") == preset
+    assert spec_of_preset(preset).rewards["scheme"] == "own"
+    foreign = Preset.from_dict({"reward": {"calm": {"weight": 1.0, "term": {"kind": "mine:calm"}}}})
+    assert Preset.from_dict(foreign.to_dict()) == foreign
+    with pytest.raises(SettingsError, match="'mine:calm' is a class of somebody's own and was not handed over"):
+        foreign.scheme()
+
+
+@pytest.mark.parametrize(
+    ("reward", "said"),
+    [
+        ({"a": 3}, "Preset.reward.a: needs a table with weight and term"),
+        ({"a": {"weight": 1.0, "term": {"kind": "Joy"}}}, "Preset.reward.a.term.kind: unknown kind 'Joy'"),
+        ({"a": {"weight": "much", "term": {"kind": "Effort"}}}, "Preset.reward.*number.*given: 'much'"),
+        (3, "Preset.reward.*given: 3"),
+    ],
+)
+def test_a_reward_that_is_none_is_named(reward, said):
+    with pytest.raises(SettingsError, match=said):
+        Preset.from_dict({"reward": reward})

@@ -16,9 +16,9 @@ from torch import nn
 from shepherd_phys.controllers.learned import Policy
 from shepherd_phys.controllers.network import input_shape
 from shepherd_phys.controllers.policy_files import PolicyError, PolicySpec, write_policy
+from shepherd_phys.envs.rewards import to_table
 from shepherd_phys.learning.network import SectorFeatures, TeamPolicy
 from shepherd_phys.learning.preset import CriticNetwork, Preset
-from shepherd_phys.settings import tagged
 
 
 def spec_of(preset: Preset, shepherd_steps: int = 0) -> PolicySpec:
@@ -30,9 +30,9 @@ def spec_of(preset: Preset, shepherd_steps: int = 0) -> PolicySpec:
     if preset.init is not None:
         training["init"] = Path(preset.init).name  # where it lay is nobody's business
     rewards = {
-        "scheme": preset.reward,
+        "scheme": preset.reward_name,
         "credit": preset.credit,
-        "terms": {name: {"weight": weight, "term": tagged(term)} for name, (weight, term) in preset.scheme().items()},
+        "terms": to_table(preset.scheme()),
     }
     return PolicySpec(
         scenario=preset.scenario,

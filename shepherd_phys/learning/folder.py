@@ -71,7 +71,8 @@ def agree(folder: Path, preset: Preset, classes: Iterable[Any] = ()) -> Preset:
         SettingsError: it is another run, or none that can be read.
     """
     kept = Preset.from_toml(folder / PRESET, classes)
-    if kept.but(budget=preset.budget) != preset:
+    # as they are written: two objects of a user's class need not be equal where they are the same
+    if kept.but(budget=preset.budget).to_dict() != preset.to_dict():
         raise SettingsError(f"{folder}: holds a run with other settings")
     if kept.budget != preset.budget and kept.ppo.last_learning_rate is not None:
         raise SettingsError(f"{folder}: its learning rate falls over its budget, {kept.budget}, which stays what it is")

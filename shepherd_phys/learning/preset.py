@@ -20,11 +20,21 @@ from shepherd_phys.controllers.network import (
 )
 from shepherd_phys.controllers.policy_files import MAX_FRAMES, MAX_WEIGHTS, Acting
 from shepherd_phys.envs.mixture import Mixture
-from shepherd_phys.envs.rewards import SCHEMES, Effort, Gathered, Occlusion, Term
+from shepherd_phys.envs.rewards import (
+    SCHEMES,
+    Effort,
+    Gathered,
+    Occlusion,
+    Scheme,
+    Term,
+    checked,
+    from_table,
+    to_table,
+)
 from shepherd_phys.lidar import Lidar
 from shepherd_phys.mirror import Side, check
 from shepherd_phys.scenario import SCENARIOS, Scenario
-from shepherd_phys.settings import Settings, SettingsError, read_toml, settings, write_toml
+from shepherd_phys.settings import Foreign, Settings, SettingsError, read_toml, settings, write_toml
 
 FOLDER = Path(__file__).parent / "presets"
 MOST_NUMBERS = 2**32
@@ -133,8 +143,8 @@ class Preset(Settings):
     times shepherds).
     """  # noqa: D205
 
-    reward: str = "wild"
-    """Name of the reward scheme."""
+    reward: str | Mapping[str, tuple[float, Any]] = "wild"
+    """Name of the reward scheme, or one of your own: name -> (weight, term)."""
     effort: float = Field(default=0.0, ge=0)
     """Weight of the cost of walking; 0: none."""
     effort_team: int = Field(default=1, ge=1, le=1000)
@@ -200,13 +210,16 @@ class Preset(Settings):
     validation: Validation = Validation()
 
     def __post_init__(self) -> None:
-        if self.reward not in SCHEMES:
+        if isinstance(self.reward, str) and self.reward not in SCHEMES:
             raise ValueError(f"reward: {self.reward!r} is not one of {', '.join(SCHEMES)}")
+        for name, (_, term) in self._terms().items():
+            if not (callable(term) or isinstance(term, Foreign)):
+                raise ValueError(f"reward[{name!r}]: needs a term that can be called (given: {term!r})")
         for name in self.scenarios:
             if name not in SCENARIOS:
                 raise ValueError(f"scenarios: {name!r} is not one of {', '.join(SCENARIOS)}")
-        if self.alpha is not None and not any(isinstance(t, Occlusion) for _, t in SCHEMES[self.reward].values()):
-            raise ValueError(f"alpha: the reward {self.reward!r} has no occlusion term (given: {self.alpha})")
+        if self.alpha is not None and not any(isinstance(t, Occlusion) for _, t in self._terms().values()):
+            raise ValueError(f"alpha: the reward {self.reward_name!r} has no occlusion term (given: {self.alpha})")
         if not self.scenario.shepherds:
             raise ValueError("scenario.shepherds: there must be one, whose body the teams have")
         if self.scenario.flock_sizes is not None:
@@ -301,9 +314,21 @@ class Preset(Settings):
             uneven=self.uneven,
         )
 
+    @property
+    def reward_name(self) -> str:
+        """The scheme's name; "own" where it has none."""
+        return self.reward if isinstance(self.reward, str) else "own"
+
+    def _terms(self) -> Scheme:
+        return SCHEMES[self.reward] if isinstance(self.reward, str) else self.reward
+
     def scheme(self) -> dict[str, tuple[float, Term]]:
-        """The reward scheme, with what the preset changes and adds."""
-        scheme = dict(SCHEMES[self.reward])
+        """The reward scheme, with what the preset changes and adds.
+
+        Raises:
+            SettingsError: a term is a user's own and was not handed over.
+        """
+        scheme = dict(checked(self._terms()))
         if self.alpha is not None:
             for name, (weight, term) in scheme.items():
                 if isinstance(term, Occlusion):
@@ -348,18 +373,27 @@ class Preset(Settings):
         except SettingsError as error:
             raise SettingsError(f"init: {name} has another lidar than the preset: {error}") from None
 
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data from which `from_dict` makes an equal preset."""
+        table = Settings.to_dict(self)
+        if not isinstance(self.reward, str):
+            table["reward"] = to_table(self.reward)
+        return table
+
     @classmethod
     def from_dict(cls, table: Mapping[str, Any], classes: Iterable[Any] = ()) -> Preset:
         """The preset that plain data describe; what is left out keeps its default.
 
         Args:
             table: what `to_dict` gives, or parts of it.
-            classes: a user's own classes that its scenario names; nothing is ever imported by name.
+            classes: a user's own classes that its scenario and its reward name; nothing is ever imported by name.
 
         Raises:
             SettingsError: a field is unknown or impossible.
         """
-        values = dict(table)
+        values, classes = dict(table), tuple(classes)
+        if isinstance(values.get("reward"), Mapping):
+            values["reward"] = from_table(values["reward"], classes, "Preset.reward")
         if isinstance(values.get("scenario"), str) and values["scenario"] in SCENARIOS:
             values["scenario"] = SCENARIOS[values["scenario"]]
         if isinstance(values.get("scenario"), Mapping):
