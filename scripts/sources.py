@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
@@ -10,13 +11,15 @@ from typing import Protocol
 import numpy as np
 
 from shepherd_phys.controllers import Policy
-from shepherd_phys.controllers.evaluation import checked_action, trial_seed
+from shepherd_phys.controllers.evaluation import ControllerError, checked_action, trial_seed
 from shepherd_phys.envs.rewards import SCHEMES, earning_beams
 from shepherd_phys.envs.shepherding import ShepherdingEnv
 from shepherd_phys.lidar import Lidar, Scan
 from shepherd_phys.replay import Replay
 from shepherd_phys.scenario import Scenario
+from shepherd_phys.settings import SettingsError
 from shepherd_phys.state import Floats, WorldState, unit
+from shepherd_phys.workers import explain
 
 from .points import Point, find_controller
 
@@ -71,6 +74,21 @@ class Source(Protocol):
         ...
 
 
+@contextmanager
+def _in_one_line() -> Iterator[None]:
+    """Whatever a user's own classes raise becomes one line that says where.
+
+    Raises:
+        SettingsError: one of them raised something.
+    """
+    try:
+        yield
+    except (SettingsError, ControllerError):
+        raise
+    except Exception as error:
+        raise SettingsError(explain(error)) from None
+
+
 class Live:
     """An episode that is being played: trial i of ``evaluate --seed``, step for step, while nobody interferes.
 
@@ -102,6 +120,7 @@ class Live:
         """Trial and root seed."""
         return f"trial {self._trial} of seed {self._seed}"
 
+    @_in_one_line()
     def restart(self, *, onward: bool = False) -> Frame:
         """The trial's first frame, or the next trial's."""
         self._trial += onward
@@ -110,6 +129,7 @@ class Live:
         self._sums = dict.fromkeys(self._scheme, 0.0)
         return self._frame(over=False)
 
+    @_in_one_line()
     def advance(self, taken: Mapping[int, Floats]) -> Frame:
         """One control step."""
         action = checked_action(self.controller.act(self._observation, self.env.state), self.controller, self.env.state)

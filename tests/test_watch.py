@@ -168,6 +168,28 @@ def test_a_controller_that_fails_leaves_no_film(tmp_path):
     assert not list(tmp_path.glob("film*"))
 
 
+@pytest.mark.parametrize(
+    ("words", "status", "message"),
+    [
+        (["--controllers", "mine:Bad"], 1, "KeyError: 'lost' (mine.py:5)"),
+        (["--controllers", "idle", "--body", "mine:Bomb"], 2, "OSError: no parts (mine.py:7)"),
+    ],
+)
+def test_what_a_users_class_raises_is_one_line(words, status, message, tmp_path, monkeypatch, capsys):
+    (tmp_path / "mine.py").write_text(
+        "from shepherd_phys.bodies import Disc\nclass Bad:\n    lidar = None\n    def reset(self, rng): ...\n"
+        "    def act(self, observation, state): raise KeyError('lost')\nclass Bomb(Disc):\n"
+        "    def build(self): raise OSError('no parts')\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "mine", raising=False)
+    assert watch.main([*words, "--scenario", "small", "--out", "film.gif"]) == status
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line == f"shepherd-phys watch: {message}"
+    assert not list(tmp_path.glob("film*"))
+
+
 def test_options_reach_the_player():
     words = ["--controllers", "idle", "--scenario", "small", "--flocks", "1", "--shepherds", "3", "--body", "Flyer"]
     options = watch.read_options([*words, "--sheep", "9", "--dark", "--beams", "--speed", "4", "--trial", "2"])
