@@ -12,7 +12,7 @@ import numpy as np
 from shepherd_phys.camera import Camera, Size, Smooth, fit
 from shepherd_phys.canvas import Canvas, pygame_ce
 from shepherd_phys.lidar import Scan
-from shepherd_phys.overlays import draw_note, draw_table
+from shepherd_phys.overlays import Corner, draw_note, draw_table
 from shepherd_phys.palette import THEMES
 from shepherd_phys.render import paint
 from shepherd_phys.replay import detection_radius
@@ -61,6 +61,7 @@ class View:
     def __init__(self, source: Source) -> None:
         self.source = source
         self.camera = Smooth()
+        self.corner = Corner()
         self.restart()
 
     def restart(self, *, onward: bool = False) -> None:
@@ -337,6 +338,7 @@ class Player:
                 earning=earning,
                 chosen=chosen,
                 theme=self.theme,
+                panel=view.corner,
                 rewards=view.now.rewards,
                 title=f"{view.source.name}\n{view.source.label}",
             )
