@@ -136,7 +136,7 @@ def _font(height: int) -> Any:
 def lettering(text: str, height: int, color: str) -> Surface:
     """Set a line of text, ``height`` px high.
 
-    Letters stand on whole pixels where they are set, so small ones are set larger and then made small: they stand evenly.
+    Letters stand on whole pixels where they are set, so they are set larger and then made small: they stand evenly.
     """
     large = _font(LETTERING * height).render(text, True, color)
     size = tuple(-(-side // LETTERING) for side in large.get_size())

@@ -68,8 +68,8 @@ def draw_beams(
 class Corner:
     """The corner in which the panel stands, from picture to picture: it stays until something walks in behind it.
 
-    Then it goes where least is hidden, and of such corners to the one with least within `CALM` pixels, so that it neither
-    hides what there is to see nor jumps to and fro.
+    Then it goes where least is hidden, and of such corners to the one with least within `CALM` pixels, so that it
+    neither hides what there is to see nor jumps to and fro.
     """
 
     def __init__(self) -> None:

@@ -200,7 +200,7 @@ def test_the_corner_is_kept_while_nothing_is_hidden():
 def test_small_pictures_tell_less_before_they_tell_nothing():
     state = make([(0, 0)], [(1, 1), (2, -2)])
     sizes = [
-        Panel(Canvas((side, side), "#FFFFFF"), state, {"a": 1.0, "b": 2.0}, LIGHT).size for side in (640, 140, 90, 40)
+        Panel(Canvas((side, side), "#FFFFFF"), state, {"a": 1.0, "b": 2.0}, LIGHT).size for side in (640, 200, 140, 40)
     ]
     widths, heights = zip(*sizes, strict=True)
     assert list(widths) == sorted(widths, reverse=True) and list(heights) == sorted(heights, reverse=True)
