@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import signal
 import sys
+import threading
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NoReturn
 
 import numpy as np
 import tyro
@@ -108,7 +110,8 @@ def main(argv: Sequence[str]) -> int:
                 save_png(last, options.out)
                 count = 1
             else:
-                count = write_film(film(player, options), options.out, options.fps)
+                with tidy_end():
+                    count = write_film(film(player, options), options.out, options.fps)
         except DisplayError as error:
             return fail(PROG, error, 2)
         except (ControllerError, SettingsError, OSError) as error:
@@ -116,6 +119,24 @@ def main(argv: Sequence[str]) -> int:
     if options.out is not None:
         print(f"{options.out}  ({count} picture{'s' * (count != 1)})")
     return 0
+
+
+@contextlib.contextmanager
+def tidy_end() -> Iterator[None]:
+    """Let a signal that asks this process to end do so by `SystemExit`: what is half written is then removed."""
+
+    def leave(number: int, _: object) -> NoReturn:
+        raise SystemExit(128 + number)
+
+    asked = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    if threading.current_thread() is not threading.main_thread():  # only there may Python handle signals
+        asked = []
+    before = {number: signal.signal(number, leave) for number in asked}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def read_options(argv: Sequence[str]) -> Watch:

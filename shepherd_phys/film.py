@@ -102,18 +102,14 @@ def _write_gif(pictures: Iterator[Picture], part: Path, fps: float) -> int:
     def drawn() -> Iterator[Image.Image]:
         nonlocal count
         for picture in pictures:
+            frame = Image.fromarray(picture).quantize(128, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+            # in whole hundredths of a second, and yet as long in sum as it should be
+            frame.info["duration"] = 10 * (round(100 * (count + 1) / fps) - round(100 * count / fps))
             count += 1
-            yield Image.fromarray(picture).quantize(128, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+            yield frame
 
     frames = drawn()
     first = next(frames)
     with part.open("wb") as file:
-        first.save(
-            file,
-            format="GIF",
-            save_all=True,
-            append_images=frames,
-            duration=round(100 / fps) * 10,
-            loop=0,
-        )
+        first.save(file, format="GIF", save_all=True, append_images=frames, loop=0)
     return count
