@@ -61,7 +61,6 @@ class View:
     def __init__(self, source: Source) -> None:
         self.source = source
         self.camera = Smooth()
-        self.corner = Corner()
         self.restart()
 
     def restart(self, *, onward: bool = False) -> None:
@@ -73,6 +72,7 @@ class View:
         steps = max(1, round(TRAIL_SECONDS / self.source.scenario.control_dt))
         self.trails: deque[Floats] = deque(maxlen=steps)
         self.camera.reset()
+        self.corner = Corner()
 
     def advance(self, taken: dict[int, Floats]) -> None:
         """One control step, if there is one left."""

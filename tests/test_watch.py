@@ -88,21 +88,9 @@ def test_a_gif_lasts_as_long_as_it_should(tmp_path, fps):
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows ends a process without asking")
 def test_a_film_that_is_told_to_end_leaves_nothing(tmp_path):
-    words = [
-        "--controllers",
-        "idle",
-        "--scenario",
-        "small",
-        "--size",
-        "160",
-        "120",
-        "--speed",
-        "0.25",
-        "--out",
-        "a.mp4",
-    ]
+    small = ["--controllers", "idle", "--scenario", "small", "--size", "160", "120", "--speed", "0.25"]
     running = subprocess.Popen(
-        [PROGRAM, "watch", *words], cwd=tmp_path, env=HEADLESS, stderr=subprocess.PIPE, text=True
+        [PROGRAM, "watch", *small, "--out", "a.mp4"], cwd=tmp_path, env=HEADLESS, stderr=subprocess.PIPE, text=True
     )
     end = time.monotonic() + 120
     while not (tmp_path / "a.mp4.part").exists():
@@ -165,7 +153,9 @@ def test_without_pygame(monkeypatch, capsys):
     [
         (["--out", "film.avi"], "film.avi: a film ends in .mp4 or .gif (given: '.avi')"),
         (["--out", "film"], "(given: 'no ending')"),
-        (["--out", "nowhere/film.mp4"], "no such folder"),
+        (["--out", "nowhere/film.mp4"], "film cannot be written: no such folder: 'nowhere'"),
+        (["--out", "nowhere/end.png"], "picture cannot be written: no such folder: 'nowhere'"),
+        (["--replay", "a.npz", "--out", "nowhere/a.html"], "page cannot be written: no such folder: 'nowhere'"),
         (["--out", "film.gif", "--fps", "200"], "fps: must be from 1 to 50"),
         (["--controllers", "wolf"], "controllers: 'wolf' is unknown"),
         (["--controllers", "a", "b", "c"], "controllers: one or two side by side (given: 3)"),
@@ -195,6 +185,15 @@ def test_bad_input_is_one_line(words, message, monkeypatch, capsys, tmp_path):
     assert said.out == "" and said.err.count("\n") == 1
     assert said.err.startswith("shepherd-phys watch: ") and message in said.err
     assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize("name", ["folder.png", "folder.mp4"])
+def test_a_folder_in_the_way_is_told_before_anything_is_run(name, monkeypatch, capsys, tmp_path):
+    (tmp_path / name).mkdir()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(watch, "make_player", None)
+    assert main(["watch", "--out", name]) == 2
+    assert f"cannot be written: a folder is in its place: '{name}'\n" in capsys.readouterr().err
 
 
 def test_a_controller_that_fails_leaves_no_film(tmp_path):
