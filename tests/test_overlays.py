@@ -189,9 +189,7 @@ def test_the_corner_is_kept_while_nothing_is_hidden():
     everywhere = np.array([(x + dx, y) for x in (60, 340) for y in (60, 340) for dx in (-20, 0, 20)])
     assert corner(boxes, everywhere, np.ones(12)) == "upper left"  # no other is better
     assert corner(boxes, everywhere, np.where(everywhere[:, 0] > 300, 0.5, 1.0)) == "upper right"
-    near = np.array(
-        [(50, 50), (120, 300), (280, 300)]
-    )  # beside lower left, and nearer to lower right: the calm one is taken
+    near = np.array([(50, 50), (120, 300), (280, 300)])  # beside both of the lower ones: the calm one is taken
     assert Corner()(boxes, near, np.array([1.0, 1.0, 2.0])) == "upper right"
     beside = ((10, 10, 20, 20), np.array([(35.0, 20.0)]), one)
     assert hidden(*beside) == 0 and hidden(*beside, 4) == 0 and hidden(*beside, 6) == 1
