@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from shepherd_phys.camera import Smooth
 from shepherd_phys.imperfections import Sight
 from shepherd_phys.lidar import Lidar, Scan, Stack
+from shepherd_phys.overlays import Corner
 from shepherd_phys.palette import THEMES
 from shepherd_phys.scenario import Scenario, load_scenario
 from shepherd_phys.settings import SettingsError
@@ -135,6 +136,7 @@ class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         # in step with the world: films and windows show it as fast as it is
         self.metadata = {**self.metadata, "render_fps": max(1, round(1.0 / self.scenario.control_dt))}
         self._camera = Smooth()
+        self._corner = Corner()
         self._sums: dict[str, float] = {}
         self._window: Window | None = None
         self._closed_by_hand = False
@@ -192,6 +194,7 @@ class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._trails.clear()
         self._start = state.sheep_pos
         self._camera.reset()
+        self._corner = Corner()
         self._sums = dict.fromkeys(self._scheme, 0.0)
         self._scan = self._look()
         if self._stack is not None and self.lidar is not None:
@@ -267,6 +270,7 @@ class ShepherdingEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             scan=self._scan if self.render_beams else None,
             earning=earning_beams(self._scheme, self._scan) if self.render_beams else None,
             theme=self.render_theme,
+            panel=self._corner,
             rewards=self._sums,
         )
         if self._window is None:

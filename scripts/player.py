@@ -12,7 +12,7 @@ import numpy as np
 from shepherd_phys.camera import Camera, Size, Smooth, fit
 from shepherd_phys.canvas import Canvas, pygame_ce
 from shepherd_phys.lidar import Scan
-from shepherd_phys.overlays import draw_note, draw_table
+from shepherd_phys.overlays import Corner, draw_note, draw_table
 from shepherd_phys.palette import THEMES
 from shepherd_phys.render import paint
 from shepherd_phys.replay import detection_radius
@@ -72,6 +72,7 @@ class View:
         steps = max(1, round(TRAIL_SECONDS / self.source.scenario.control_dt))
         self.trails: deque[Floats] = deque(maxlen=steps)
         self.camera.reset()
+        self.corner = Corner()
 
     def advance(self, taken: dict[int, Floats]) -> None:
         """One control step, if there is one left."""
@@ -337,6 +338,7 @@ class Player:
                 earning=earning,
                 chosen=chosen,
                 theme=self.theme,
+                panel=view.corner,
                 rewards=view.now.rewards,
                 title=f"{view.source.name}\n{view.source.label}",
             )

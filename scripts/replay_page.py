@@ -21,6 +21,7 @@ from shepherd_phys.files import whole_file
 from shepherd_phys.obstacles import Outline, outlines
 from shepherd_phys.render import THEMES
 from shepherd_phys.replay import Replay, ReplayError, detection_radius
+from shepherd_phys.state import Floats, unit
 
 TEMPLATE = Path(__file__).with_name("replay_page.html")
 THEME = THEMES["light"]
@@ -30,6 +31,8 @@ STATES = ("wild, grazing", "wild, threatened", "arrived, grazing", "arrived, thr
 """What the two bits of a sheep's state mean; the second group of four: in the goal now."""
 LEVELS = 65_535
 """Whole numbers across the field."""
+TURNS = 255
+"""Directions in a full turn, for the dots in front of agents."""
 ARC_POINTS = 24
 """Corners of a drawn circle."""
 
@@ -82,12 +85,16 @@ def page(replay: Replay) -> str:
 def _facts(replay: Replay) -> str:
     parts = [
         replay.scenario_name,
-        f"{replay.n_sheep} sheep in {replay.scenario.n_flocks} flocks",
-        f"{replay.n_shepherds} shepherds",
+        f"{replay.n_sheep} sheep in {_counted(replay.scenario.n_flocks, 'flock')}",
+        _counted(replay.n_shepherds, "shepherd"),
         f"seed {replay.seed}",
         f"version {replay.version}",
     ]
     return " · ".join(part for part in parts if part)
+
+
+def _counted(n: int, what: str) -> str:
+    return f"{n} {what}{'s' * (n != 1)}"
 
 
 def _result(replay: Replay) -> str:
@@ -99,7 +106,7 @@ def _result(replay: Replay) -> str:
 
 
 def _numbered(data: Any, numbers: dict[str, str]) -> Any:
-    """bokeh's JSON with its models numbered from 1: bokeh counts on through a process, and a replay has one page."""
+    """The JSON of bokeh, its models numbered from 1: bokeh counts on through a process, and a replay has one page."""
     if isinstance(data, dict):
         return {
             key: numbers.setdefault(value, f"p{len(numbers) + 1}")
@@ -136,6 +143,20 @@ def _whole(values: ArrayLike, low: float, step: float) -> str:
     return base64.b64encode(np.clip(levels, 0, LEVELS).astype("<u2").tobytes()).decode()
 
 
+def _looks(replay: Replay) -> Floats:
+    """Where the shepherds look (T, P, 2): where their bodies are turned to, discs where they go, 0 while they stand."""
+    angle = replay.states["shepherd_angle"][..., None]
+    turned = np.concatenate([np.cos(angle), np.sin(angle)], axis=-1)
+    return np.where(angle == 0.0, unit(replay.states["shepherd_vel"]), turned)
+
+
+def _turns(ways: Floats) -> str:
+    """Directions (.., 2) as 8-bit numbers, base64: 0 for none, else 1 to 255 round from -pi."""
+    angle = np.arctan2(ways[..., 1], ways[..., 0])
+    levels = 1 + np.rint((angle + np.pi) / (2 * np.pi) * TURNS) % TURNS
+    return base64.b64encode((levels * (ways != 0).any(axis=-1)).astype(np.uint8).tobytes()).decode()
+
+
 def _episode(replay: Replay, field: tuple[float, float, float]) -> dict[str, Any]:
     x, y, side = field
     step = side / LEVELS
@@ -143,6 +164,7 @@ def _episode(replay: Replay, field: tuple[float, float, float]) -> dict[str, Any
     for kind in ("sheep", "shepherd"):
         places, velocity = replay.states[f"{kind}_pos"], replay.states[f"{kind}_vel"]
         speed = np.hypot(velocity[..., 0], velocity[..., 1])
+        look = replay.states["sheep_heading"] if kind == "sheep" else _looks(replay)
         top = max(float(speed.max(initial=0.0)), 1e-9)
         agents[kind] = {
             "n": places.shape[1],
@@ -150,6 +172,7 @@ def _episode(replay: Replay, field: tuple[float, float, float]) -> dict[str, Any
             "y": _whole(places[..., 1], y - side / 2, step),
             "speed": _whole(speed, 0.0, top / LEVELS),
             "top_speed": top,
+            "look": _turns(look),
             "radius": replay.constants[f"{kind}_radius"].tolist(),
         }
     threatened = np.stack([replay.threatened(t) for t in range(len(replay))])
@@ -229,6 +252,9 @@ def _world(replay: Replay, field: tuple[float, float, float]) -> Any:
     walking = plot.circle(
         "x", "y", radius="radius", source=team, fill_color="color", line_color=THEME.shepherd_edge, line_width=1.2
     )
+    for kind, color in (("sheep", THEME.sheep_face), ("shepherds", THEME.shepherd_edge)):
+        faces = ColumnDataSource({"x": [], "y": [], "radius": []}, name=f"{kind}_faces")
+        plot.circle("x", "y", radius="radius", source=faces, fill_color=color, line_color=None)
     about = [("at", "@x{0.00}, @y{0.00} m"), ("speed", "@speed{0.00} m/s"), ("to the goal", "@away{0.00} m")]
     plot.add_tools(
         HoverTool(renderers=[drawn], tooltips=[("sheep", "@number"), *about, ("state", "@state")], name="hover_sheep"),

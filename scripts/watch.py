@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import contextlib
+import signal
 import sys
+import threading
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-import numpy as np
 import tyro
-from numpy.typing import NDArray
 
 from shepherd_phys.camera import MAX_SIZE, checked_size
 from shepherd_phys.canvas import pygame_ce
 from shepherd_phys.controllers.evaluation import ControllerError
 from shepherd_phys.envs.rewards import checked
-from shepherd_phys.film import checked_film, write_film
+from shepherd_phys.files import checked_place
+from shepherd_phys.film import Picture, checked_film, write_film
 from shepherd_phys.render import save_png
 from shepherd_phys.replay import Replay
 from shepherd_phys.replay_file import load_replay
@@ -76,7 +77,7 @@ class Watch(WorldFlags):
 OF_LIVE = ("controllers", "scenario", "flocks", "cohesion", "shepherds", "sheep", "body", "flock", "seed", "trial",
            "rewards", "beams")  # fmt: skip
 """What a replay has settled."""
-PAGE = ".html"
+PAGE, PICTURE = ".html", ".png"
 OF_PICTURES = ("steps", "speed", "fps", "size", "camera", "dark")
 """What a page has not."""
 LEAST = {**WORLD_LEAST, "seed": 0, "trial": 0, "steps": 1, "fps": 1}
@@ -86,11 +87,14 @@ def main(argv: Sequence[str]) -> int:
     """Run the command; the exit status: 0, 1 if something failed, 2 for a mistake of the user, 130 for Ctrl-C."""
     try:
         options = read_options(argv)
+        ending = "" if options.out is None else options.out.suffix.lower()
+        if options.out is not None and ending in (PICTURE, PAGE):
+            checked_place(options.out, "page" if ending == PAGE else "picture")
         replays = [load_replay(path) for path in options.replay]
-        if options.out is not None and options.out.suffix.lower() == PAGE:
+        if options.out is not None and ending == PAGE:
             return write_pages(replays, options.out)
         pygame_ce()
-        if options.out is not None and options.out.suffix.lower() != ".png":
+        if options.out is not None and ending != PICTURE:
             checked_film(options.out, options.fps)
     except (ValueError, OSError, ImportError) as error:
         return fail(PROG, error, 2)
@@ -103,12 +107,12 @@ def main(argv: Sequence[str]) -> int:
         try:
             if options.out is None:
                 run(player, Window(player.size, " and ".join(source.name for source in sources)))
-            elif options.out.suffix.lower() == ".png":
+            elif ending == PICTURE:
                 (last,) = deque(film(player, options), maxlen=1)
                 save_png(last, options.out)
                 count = 1
             else:
-                count = write_film(film(player, options), options.out, options.fps)
+                count = write_film(until_told(film(player, options)), options.out, options.fps)
         except DisplayError as error:
             return fail(PROG, error, 2)
         except (ControllerError, SettingsError, OSError) as error:
@@ -205,7 +209,7 @@ def run(player: Player, window: Window) -> None:
         window.close()
 
 
-def film(player: Player, options: Watch) -> Iterator[NDArray[np.uint8]]:
+def film(player: Player, options: Watch) -> Iterator[Picture]:
     """The pictures of a film, from the first state to the last step asked for, or the last there is."""
     yield player.canvas().picture()
     while not player.over:
@@ -217,3 +221,27 @@ def film(player: Player, options: Watch) -> Iterator[NDArray[np.uint8]]:
             seconds = min(seconds, left)
         player.tick(seconds)
         yield player.canvas().picture()
+
+
+def until_told(pictures: Iterable[Picture]) -> Iterator[Picture]:
+    """The same pictures, until a signal asks this process to end: it does so between two of them, by `SystemExit`.
+
+    So what is half written can be removed. A second signal ends the process at once.
+    """
+    told: list[int] = []
+
+    def note(number: int, _: object) -> None:
+        told.append(number)
+        signal.signal(number, signal.SIG_DFL)
+
+    here = threading.current_thread() is threading.main_thread()  # only there may Python handle signals
+    names = [name for name in ("SIGTERM", "SIGHUP") if here and hasattr(signal, name)]
+    before = {number: signal.signal(number, note) for number in (getattr(signal, name) for name in names)}
+    try:
+        for picture in pictures:
+            if told:
+                raise SystemExit(128 + told[0])
+            yield picture
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

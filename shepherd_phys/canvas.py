@@ -29,6 +29,8 @@ Surface = Any
 
 SUBPIXELS = 4
 """Places within a pixel where a disc can stand, each way; discs are drawn once for each and kept."""
+LETTERING = 3
+"""How much larger lettering is set than it is put."""
 LARGE = 48
 """[px]: larger discs are not kept."""
 
@@ -132,8 +134,13 @@ def _font(height: int) -> Any:
 
 @lru_cache(maxsize=512)
 def lettering(text: str, height: int, color: str) -> Surface:
-    """Set a line of text, ``height`` px high."""
-    return _font(height).render(text, True, color)
+    """Set a line of text, ``height`` px high.
+
+    Letters stand on whole pixels where they are set, so they are set larger and then made small: they stand evenly.
+    """
+    large = _font(LETTERING * height).render(text, True, color)
+    size = tuple(-(-side // LETTERING) for side in large.get_size())
+    return pygame_ce().transform.smoothscale(large, size) if text else large
 
 
 @lru_cache(maxsize=1)

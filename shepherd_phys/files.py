@@ -2,10 +2,25 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+
+
+def checked_place(path: Path, what: str) -> None:
+    """Whether a file can be put there; to be asked before there is something to lose.
+
+    Raises:
+        OSError: there is no such folder, it lets nobody write, or a folder is in the file's place; names what it is.
+    """
+    if not path.resolve().parent.is_dir():
+        raise FileNotFoundError(errno.ENOENT, f"{what} cannot be written: no such folder", str(path.parent))
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, f"{what} cannot be written: a folder is in its place", str(path))
+    if not os.access(path.resolve().parent, os.W_OK | os.X_OK):
+        raise PermissionError(errno.EACCES, f"{what} cannot be written: its folder is closed", str(path.parent))
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shepherd_phys.files import whole_file
+from shepherd_phys.files import checked_place, whole_file
 
 Picture = NDArray[np.uint8]
 ENDINGS = (".mp4", ".gif")
@@ -26,7 +26,7 @@ def checked_film(path: Path, fps: float) -> None:
 
     Raises:
         ValueError: another ending than .mp4 or .gif; a number of pictures a second that it cannot have.
-        OSError: there is no such folder.
+        OSError: no file can be put there.
         ImportError: moviepy is missing; says how to install it.
     """
     if path.suffix.lower() not in ENDINGS:
@@ -34,10 +34,7 @@ def checked_film(path: Path, fps: float) -> None:
     most = MAX_GIF_FPS if path.suffix.lower() == ".gif" else 240
     if not 1 <= fps <= most:
         raise ValueError(f"fps: must be from 1 to {most} for {path.suffix.lower()} (given: {fps!r})")
-    if not path.resolve().parent.is_dir():
-        raise FileNotFoundError(2, "film cannot be written: no such folder", str(path.parent))
-    if path.is_dir():
-        raise IsADirectoryError(21, "film cannot be written: a folder is in its place", str(path))
+    checked_place(path, "film")
     _moviepy()
 
 
@@ -77,6 +74,7 @@ def _moviepy() -> Any:
 
 
 def _write_mp4(pictures: Iterator[Picture], part: Path, fps: float) -> int:
+    part.touch()  # or ffmpeg says in many lines that it cannot
     writer: Any = None
     count = 0
     try:
@@ -102,18 +100,14 @@ def _write_gif(pictures: Iterator[Picture], part: Path, fps: float) -> int:
     def drawn() -> Iterator[Image.Image]:
         nonlocal count
         for picture in pictures:
+            frame = Image.fromarray(picture).quantize(128, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+            # in whole hundredths of a second, and yet as long in sum as it should be
+            frame.info["duration"] = 10 * (round(100 * (count + 1) / fps) - round(100 * count / fps))
             count += 1
-            yield Image.fromarray(picture).quantize(128, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+            yield frame
 
     frames = drawn()
     first = next(frames)
     with part.open("wb") as file:
-        first.save(
-            file,
-            format="GIF",
-            save_all=True,
-            append_images=frames,
-            duration=round(100 / fps) * 10,
-            loop=0,
-        )
+        first.save(file, format="GIF", save_all=True, append_images=frames, loop=0)
     return count

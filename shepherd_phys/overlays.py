@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from shepherd_phys.camera import Camera
-from shepherd_phys.canvas import Canvas, lettering
+from shepherd_phys.canvas import Canvas, Size, lettering
 from shepherd_phys.lidar import Scan, beam_directions
 from shepherd_phys.palette import Theme
 from shepherd_phys.state import Floats, WorldState
@@ -15,6 +15,18 @@ from shepherd_phys.state import Floats, WorldState
 ORDER = ("goal", "obstacles", "shepherds", "sheep")
 """Channels whose beams are drawn, what matters most on top."""
 STRENGTH = {"goal": 0.3, "obstacles": 0.18, "shepherds": 0.5, "sheep": 0.5}
+
+CORNERS = ("upper left", "upper right", "lower left", "lower right")
+Box = tuple[int, int, int, int]
+"""Left, top, width, height [px]."""
+EDGE = 10
+"""[px] between a plate and the picture's border."""
+FOOT = 44
+"""[px] from the lower border, for the scale bar and a note."""
+CALM = 24.0
+"""[px]: what is so near to a panel may soon be behind it."""
+MATTERS = 10.0
+"""Sheep that a shepherd, or the goal, counts for."""
 
 
 def beam_ends(origins: Floats, readings: Floats) -> tuple[Floats, Floats]:
@@ -53,71 +65,177 @@ def draw_beams(
         canvas.discs(color, ends, 0.5 + 0.75 * width)
 
 
+class Corner:
+    """The corner in which the panel stands, from picture to picture: it stays until something walks in behind it.
+
+    Then it goes where least is hidden, and of such corners to the one with least within `CALM` pixels, so that it
+    neither hides what there is to see nor jumps to and fro.
+    """
+
+    def __init__(self) -> None:
+        self.name = CORNERS[0]
+
+    def __call__(self, boxes: Mapping[str, Box], at: Floats, weights: Floats) -> str:
+        """Choose one.
+
+        Args:
+            boxes: what the panel would cover, of each corner.
+            at: (K, 2) what is to be seen [px].
+            weights: (K,) how much it matters.
+
+        Returns:
+            its name.
+        """
+        covered = hidden(boxes[self.name], at, weights)
+        if covered > 0.0:
+            costs = {name: (hidden(box, at, weights), hidden(box, at, weights, CALM)) for name, box in boxes.items()}
+            best = min(costs, key=costs.__getitem__)
+            if costs[best][0] < covered:
+                self.name = best
+        return self.name
+
+
+def hidden(box: Box, at: Floats, weights: Floats, around: float = 0.0) -> float:
+    """The weight (K,) of what stands at (K, 2) within ``around`` of a box [px]."""
+    left, top, width, height = box
+    low, high = (left - around, top - around), (left + width + around, top + height + around)
+    return float(weights[((at > low) & (at < high)).all(axis=1)].sum())
+
+
 def text_height(canvas: Canvas) -> int:
     """Of the largest lettering [px]."""
     return int(np.clip(min(canvas.size) / 19, 18, 36))
 
 
-def draw_panel(canvas: Canvas, state: WorldState, rewards: Mapping[str, float] | None, theme: Theme) -> None:
-    """Tell, in the upper left: sheep in the goal, in numbers and as a bar; time; collisions if any; the rewards."""
-    w, h = canvas.size
-    big = text_height(canvas)
-    small, gap = max(round(big * 0.58), 14), round(big / 3)
-    inside, hits = int(state.sheep_in_goal.sum()), int(state.collisions)
-    count = lettering(f"{inside}/{state.n_sheep}", big, theme.ink)
-    label = lettering("in the goal", small, theme.faint_ink)
-    told = [(f"{state.time:.1f} s", f"{hits} collision{'s' * (hits != 1)}" if hits else " ")]
-    if rewards:
-        sums = [*rewards.items(), *([("reward", sum(rewards.values()))] if len(rewards) > 1 else [])]
-        told += [(name if len(name) < 20 else name[:19] + "…", f"{value:+.3f}") for name, value in sums]
-    lines = [tuple(lettering(text, small, theme.faint_ink) for text in line) for line in told]
-    inner = max(
-        count.get_width() + gap + label.get_width(),
-        *(left.get_width() + 2 * gap + right.get_width() for left, right in lines),
-    )
-    inner = -(-inner // 8) * 8  # a digit more must not make the plate tremble
-    leading = lines[0][0].get_height() + gap // 3
-    height = count.get_height() + len(lines) * leading + 3 * gap + 4
-    width = inner + 2 * gap
-    if 20 + width > w or 20 + height > h * 0.6:
-        if rewards:
-            draw_panel(canvas, state, None, theme)
+def small_height(canvas: Canvas) -> int:
+    """Of the other lettering [px]."""
+    return max(round(text_height(canvas) * 0.58), 15)
+
+
+class Panel:
+    """What is told of a state: sheep in the goal, in numbers and as a bar; time; collisions if any; the rewards.
+
+    Where it would take up too much of the canvas it tells less: first the rewards are left out, then words.
+
+    Args:
+        canvas: for which it is set.
+        state: of which it tells.
+        rewards: what each term has given, weighted.
+        theme: the colours.
+
+    Attributes:
+        size: (w, h) [px]; (0, 0) where there is no room for any.
+    """
+
+    def __init__(self, canvas: Canvas, state: WorldState, rewards: Mapping[str, float] | None, theme: Theme) -> None:
+        self._theme, self._share = theme, int(state.sheep_in_goal.sum()) / state.n_sheep
+        hits, small = int(state.collisions), small_height(canvas)
+        clock = f"{state.time:.1f} s"
+        told = [(clock, f"{hits} collision{'s' * (hits != 1)}" if hits else " ")]
+        sums = [*(rewards or {}).items()]
+        sums += [("reward", sum((rewards or {}).values()))] if len(sums) > 1 else []
+        terms = [(name if len(name) < 20 else name[:19] + "…", f"{value:+.3f}") for name, value in sums]
+        self._gap = round(text_height(canvas) / 3)
+        self._count = lettering(f"{int(state.sheep_in_goal.sum())}/{state.n_sheep}", text_height(canvas), theme.ink)
+        self._label = lettering("in the goal", small, theme.faint_ink)
+        for label, lines in ((True, told + terms), (True, told), (False, [(clock, "")])):
+            self._labelled = label
+            self._lines = [tuple(lettering(text, small, theme.faint_ink) for text in line) for line in lines]
+            self.size = self._measured()
+            if self.size[0] + 2 * EDGE <= 0.6 * canvas.size[0] and self.size[1] + 2 * EDGE <= 0.6 * canvas.size[1]:
+                return
+        self.size = (0, 0)
+
+    @property
+    def _leading(self) -> int:
+        return int(self._lines[0][0].get_height() + self._gap // 2)
+
+    def _measured(self) -> Size:
+        gap, count, label = self._gap, self._count, self._label
+        widths = [
+            left.get_width() + 2 * gap * bool(right.get_width()) + right.get_width() for left, right in self._lines
+        ]
+        inner = max(count.get_width() + (gap + label.get_width()) * self._labelled, *widths)
+        inner = -(-inner // 8) * 8  # a digit more must not make the plate tremble
+        return inner + 2 * gap, count.get_height() + len(self._lines) * self._leading + 3 * gap + 4
+
+    def boxes(self, canvas: Canvas, title: int) -> dict[str, Box]:
+        """What it covers in each corner: under a title of so many pixels, and over the scale bar and a note."""
+        w, h = self.size
+        right, bottom = canvas.size[0] - EDGE - w, max(canvas.size[1] - FOOT - h, EDGE)
+        places = (EDGE, EDGE), (right, EDGE + title), (EDGE, bottom), (right, max(bottom, EDGE + title))
+        return {name: (x, y, w, h) for name, (x, y) in zip(CORNERS, places, strict=True)}
+
+    def draw(self, canvas: Canvas, box: Box) -> None:
+        """Draw it there; what walks behind it shows through."""
+        theme, gap, inner = self._theme, self._gap, box[2] - 2 * self._gap
+        canvas.plate(theme.ground, box[0], box[1], self.size, corner=gap / 2, edge=theme.grid[1], alpha=0.85)
+        x, y, count, label = box[0] + gap, box[1] + gap, self._count, self._label
+        canvas.put(count, x, y)
+        if self._labelled:
+            canvas.put(label, x + count.get_width() + gap, y + count.get_height() - label.get_height())
+        y += count.get_height() + gap // 2 + 2
+        canvas.box(theme.grid[1], x, y - 2, inner, 4)
+        canvas.box(theme.goal_ring, x, y - 2, inner * self._share, 4)
+        y += gap // 2 + 4
+        for left, right in self._lines:
+            canvas.put(left, x, y)
+            canvas.put(right, x + inner - right.get_width(), y)
+            y += self._leading
+
+
+def draw_panel(
+    canvas: Canvas,
+    state: WorldState,
+    camera: Camera,
+    rewards: Mapping[str, float] | None,
+    theme: Theme,
+    *,
+    corner: Corner | None,
+    title: str,
+) -> None:
+    """Tell of a state in a corner, with lines of text in the upper right, the first one large.
+
+    Args:
+        canvas: to draw on.
+        state: of which it tells.
+        camera: of the picture.
+        rewards: what each term has given, weighted.
+        theme: the colours.
+        corner: of the panel; None: there is none.
+        title: the lines; where they do not fit beside the panel, there are none.
+    """
+    panel = Panel(canvas, state, rewards, theme) if corner is not None else None
+    beside = panel.size[0] + EDGE if panel is not None and panel.size[0] else 0
+    under = draw_title(canvas, title, theme, canvas.size[0] - beside - 2 * EDGE) if title else 0
+    if panel is None or corner is None or not panel.size[0]:
         return
-    # what walks behind the panel shows through
-    canvas.plate(theme.ground, 10, 10, (width, height), corner=gap / 2, edge=theme.grid[1], alpha=0.85)
-    x, y = 10 + gap, 10 + gap
-    canvas.put(count, x, y)
-    canvas.put(label, x + count.get_width() + gap, y + count.get_height() - label.get_height() - big // 12)
-    y += count.get_height() + gap // 2 + 2
-    canvas.box(theme.grid[1], x, y - 2, inner, 4)
-    canvas.box(theme.goal_ring, x, y - 2, inner * inside / state.n_sheep, 4)
-    y += gap // 2 + 2
-    for left, right in lines:
-        canvas.put(left, x, y)
-        canvas.put(right, x + inner - right.get_width(), y)
-        y += leading
+    points = np.concatenate([state.sheep_pos, state.shepherd_pos, state.goal_pos[None]])
+    weights = np.repeat([1.0, MATTERS, MATTERS], [state.n_sheep, state.n_shepherds, 1])
+    boxes = panel.boxes(canvas, under)
+    panel.draw(canvas, boxes[corner(boxes, camera.to_pixels(points, canvas.size), weights)])
 
 
-def draw_title(canvas: Canvas, title: str, theme: Theme) -> None:
-    """Write lines of text in the upper right, the first one large; where they do not fit beside the panel, none."""
-    big = text_height(canvas)
+def draw_title(canvas: Canvas, title: str, theme: Theme, width: float) -> int:
+    """Write lines of text in the upper right, none if they are wider than ``width`` px; how high they are [px]."""
     first, *rest = title.split("\n")
-    lines = [lettering(first, round(big * 0.8), theme.ink)]
-    lines += [lettering(line, max(round(big * 0.58), 14), theme.faint_ink) for line in rest]
-    if max(line.get_width() for line in lines) + 24 > canvas.size[0] / 2:
-        return
-    y = 14
+    lines = [lettering(first, round(text_height(canvas) * 0.8), theme.ink)]
+    lines += [lettering(line, small_height(canvas), theme.faint_ink) for line in rest]
+    if max(line.get_width() for line in lines) > width:
+        return 0
+    y = EDGE + 4
     for line in lines:
-        canvas.put(line, canvas.size[0] - 14 - line.get_width(), y)
-        y += line.get_height() + 2
+        canvas.put(line, canvas.size[0] - EDGE - 4 - line.get_width(), y)
+        y += line.get_height() + 3
+    return y - EDGE + 4
 
 
 def draw_note(canvas: Canvas, text: str, theme: Theme) -> None:
     """A plate with a line of text in the lower right."""
-    line = lettering(text, max(round(text_height(canvas) * 0.58), 14), theme.ink)
+    line = lettering(text, small_height(canvas), theme.ink)
     gap = line.get_height() // 2
     size = line.get_width() + 2 * gap, line.get_height() + 2 * gap
-    left, top = canvas.size[0] - size[0] - 10, canvas.size[1] - size[1] - 10
+    left, top = canvas.size[0] - size[0] - EDGE, canvas.size[1] - size[1] - EDGE
     canvas.plate(theme.ground, left, top, size, corner=gap / 2, edge=theme.grid[1], alpha=0.92)
     canvas.put(line, left + gap, top + gap)
 

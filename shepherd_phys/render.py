@@ -21,7 +21,7 @@ from shepherd_phys.canvas import Canvas, Floats, Picture, lettering, mixed, png
 from shepherd_phys.files import whole_file
 from shepherd_phys.lidar import Scan
 from shepherd_phys.outlines import Same, of_body, of_obstacles
-from shepherd_phys.overlays import draw_beams, draw_panel, draw_title
+from shepherd_phys.overlays import Corner, draw_beams, draw_panel
 from shepherd_phys.palette import THEMES, Theme
 from shepherd_phys.scenario import Scenario
 from shepherd_phys.state import WorldState, unit
@@ -201,7 +201,7 @@ def paint(
     earning: Floats | None = None,
     chosen: int | None = None,
     theme: Literal["light", "dark"] = "light",
-    panel: bool = True,
+    panel: bool | Corner = True,
     rewards: Mapping[str, float] | None = None,
     title: str = "",
 ) -> Canvas:
@@ -224,9 +224,10 @@ def paint(
         earning: (P, B) lengths of the beams that earn reward [m], infinity for the others; drawn stronger.
         chosen: a shepherd to be ringed.
         theme: ``"light"`` or ``"dark"``.
-        panel: whether to tell sheep in the goal, time and collisions.
+        panel: whether to tell sheep in the goal, time and collisions, in the corner where that hides least. For a film,
+            a `Corner` of its own, handed to every picture, changes seldom.
         rewards: what each term has given so far, weighted, for the panel.
-        title: lines of text for the upper right.
+        title: lines of text for the upper right; left out where they do not fit beside the panel.
 
     Raises:
         ValueError: names the argument that is impossible.
@@ -265,10 +266,8 @@ def paint(
     _draw_sheep(canvas, state, sheep, np.maximum(state.sheep_radius * scale, least), threatened, flock, look)
     sizes = np.maximum(state.shepherd_radius * scale, 1.8 * least)
     _draw_shepherds(canvas, state, shepherds, sizes, scale, team, chosen, look)
-    if panel:
-        draw_panel(canvas, state, rewards, look)
-    if title:
-        draw_title(canvas, title, look)
+    corner = panel if isinstance(panel, Corner) else Corner() if panel else None
+    draw_panel(canvas, state, camera, rewards, look, corner=corner, title=title)
     return canvas
 
 
@@ -290,4 +289,4 @@ def save_png(picture: Picture, path: str | Path) -> None:
         raise OSError(error.errno, f"picture cannot be written ({error.strerror})", str(path)) from None
 
 
-__all__ = ["THEMES", "Camera", "Theme", "draw", "fit", "paint", "save_png"]
+__all__ = ["THEMES", "Camera", "Corner", "Theme", "draw", "fit", "paint", "save_png"]

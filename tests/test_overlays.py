@@ -12,6 +12,7 @@ from shepherd_phys.envs import ShepherdingEnv
 from shepherd_phys.envs.rewards import ANY, ORIGINAL, WILD, Occlusion, earning_beams
 from shepherd_phys.lidar import Lidar, Scan
 from shepherd_phys.obstacles import Pillar
+from shepherd_phys.overlays import Corner, Panel, hidden
 from shepherd_phys.render import draw
 from shepherd_phys.scenario import Scenario
 from shepherd_phys.settings import Foreign
@@ -160,6 +161,48 @@ def test_panel_title_and_the_chosen_one():
         assert (draw(state, **options) != bare).any(), options
     assert (draw(state, rewards={"a": 1.0}) != draw(state, rewards={"a": 2.0})).any()
     np.testing.assert_array_equal(draw(state, (64, 64), title="x" * 99, rewards={"a": 1.0}), draw(state, (64, 64)))
+
+
+@pytest.mark.parametrize("size", [(160, 160), (240, 180), (320, 240), (640, 640), (1280, 720)])
+@pytest.mark.parametrize("corner", [(-1, 1), (1, 1), (-1, -1), (1, -1)])
+def test_the_panel_hides_nobody_who_can_be_spared(size, corner):
+    """A flock in one corner, a shepherd in the one across it."""
+    away, options = (
+        np.array(corner) * 8 * (size[0] / size[1], 1),
+        {"camera": Camera(center=(0, 0), width=20 * size[0] / size[1])},
+    )
+    state = make(away + np.random.default_rng(1).uniform(-1, 1, (30, 2)), [-away, (0, 0)], goal=(0, 5))
+    bare = draw(state, size, panel=False, title="collie\nseed 3", **options)
+    told = draw(state, size, title="collie\nseed 3", rewards={"occupy": 1.0, "distance": -0.2}, **options)
+    assert (told != bare).any(axis=2).sum() > 1000
+    x, y = np.floor(options["camera"].to_pixels([*state.sheep_pos, *state.shepherd_pos], size)).astype(int).T
+    np.testing.assert_array_equal(told[y, x], bare[y, x])
+
+
+def test_the_corner_is_kept_while_nothing_is_hidden():
+    boxes = {"upper left": (10, 10, 100, 100), "upper right": (290, 10, 100, 100)}
+    boxes |= {"lower left": (10, 290, 100, 100), "lower right": (290, 290, 100, 100)}
+    corner, one = Corner(), np.ones(1)
+    walk = [(200, 200), (50, 50), (105, 50), (125, 50), (200, 50), (280, 50), (300, 50), (380, 50), (200, 50)]
+    names = [corner(boxes, np.array([at]), one) for at in walk]
+    assert names == ["upper left"] + 5 * ["upper right"] + 3 * ["upper left"]
+    everywhere = np.array([(x + dx, y) for x in (60, 340) for y in (60, 340) for dx in (-20, 0, 20)])
+    assert corner(boxes, everywhere, np.ones(12)) == "upper left"  # no other is better
+    assert corner(boxes, everywhere, np.where(everywhere[:, 0] > 300, 0.5, 1.0)) == "upper right"
+    near = np.array([(50, 50), (120, 300), (280, 300)])  # beside both of the lower ones: the calm one is taken
+    assert Corner()(boxes, near, np.array([1.0, 1.0, 2.0])) == "upper right"
+    beside = ((10, 10, 20, 20), np.array([(35.0, 20.0)]), one)
+    assert hidden(*beside) == 0 and hidden(*beside, 4) == 0 and hidden(*beside, 6) == 1
+
+
+def test_small_pictures_tell_less_before_they_tell_nothing():
+    state = make([(0, 0)], [(1, 1), (2, -2)])
+    sizes = [
+        Panel(Canvas((side, side), "#FFFFFF"), state, {"a": 1.0, "b": 2.0}, LIGHT).size for side in (640, 200, 140, 40)
+    ]
+    widths, heights = zip(*sizes, strict=True)
+    assert list(widths) == sorted(widths, reverse=True) and list(heights) == sorted(heights, reverse=True)
+    assert len(set(sizes)) == 4 and sizes[-1] == (0, 0)
 
 
 def test_bad_scans():

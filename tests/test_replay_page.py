@@ -18,6 +18,7 @@ from shepherd_phys.obstacles import Box, Fence, Pillar, outlines
 from shepherd_phys.replay import ReplayError
 from shepherd_phys.scenario import SCENARIOS, Scenario
 from shepherd_phys.scripts.replay_page import LEVELS, edge, page, write_page
+from shepherd_phys.state import unit
 
 pytest.importorskip("bokeh", reason="NO PAGE WAS MADE: bokeh is missing")
 
@@ -146,7 +147,7 @@ def shown(browser, replay, tmp_path_factory):
 def numbers(browser, kind):
     """Positions (K, 2) that the page shows now."""
     got = browser.execute_script(f"const d = replay.sources.{kind}.data; return [[...d.x], [...d.y], [...d.number]]")
-    assert got[2] == list(range(len(got[0])))
+    assert got[2] == list(range(1, len(got[0]) + 1))  # as in watch and on figures
     return np.array(got[:2], dtype=float).T
 
 
@@ -193,6 +194,11 @@ def test_the_slider_scrubs_to_a_step(shown, replay, step):
     assert error * LEVELS < 200  # a field of less than 200 m in so many levels
     for kind, places in (("sheep", state.sheep_pos), ("shepherds", state.shepherd_pos)):
         assert np.abs(numbers(shown, kind) - places).max() <= error * 0.501
+    for kind, ways in (("sheep", state.sheep_heading), ("shepherds", unit(state.shepherd_vel))):
+        at = shown.execute_script(f"const d = replay.sources.{kind}_faces.data; return [[...d.x], [...d.y]]")
+        looking = np.hypot(*ways.T) > 0
+        ahead = np.reshape(at, (2, -1)).T - numbers(shown, kind)[looking]
+        assert ((unit(ahead) * ways[looking]).sum(axis=1) > 0.999).all()  # the dot is in front
     data = shown.execute_script("const d = replay.sources.sheep.data; return [[...d.away], [...d.speed], d.state]")
     assert np.allclose(data[0], state.sheep_goal_distance, rtol=0, atol=2 * error)
     assert np.allclose(data[1], np.hypot(*state.sheep_vel.T), rtol=0, atol=1e-3)

@@ -2,8 +2,10 @@
 
 import os
 import re
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import gymnasium as gym
@@ -27,12 +29,13 @@ from shepherd_phys.scripts.replay_page import page
 from shepherd_phys.scripts.sources import Recorded
 from shepherd_phys.settings import SettingsError
 
+PROGRAM = str(Path(sys.executable).parent / "shepherd-phys")
 HEADLESS = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")}
 
 
 def command(tmp_path, *words):
     return subprocess.run(
-        [str(Path(sys.executable).parent / "shepherd-phys"), "watch", *words],
+        [PROGRAM, "watch", *words],
         cwd=tmp_path,
         env=HEADLESS,
         capture_output=True,
@@ -72,6 +75,31 @@ def test_films(tmp_path, name, words, shape):
     assert all(frame.std() > 3 for frame in frames)
     assert (frames[0] != frames[-1]).any()
     assert fps == pytest.approx(10)
+
+
+@pytest.mark.parametrize("fps", [3, 10, 24, 30, 40, 50])
+def test_a_gif_lasts_as_long_as_it_should(tmp_path, fps):
+    write_film([np.full((20, 20, 3), 2 * k, np.uint8) for k in range(2 * fps)], tmp_path / "a.gif", fps)
+    with Image.open(tmp_path / "a.gif") as film:
+        lengths = [frame.info["duration"] for frame in ImageSequence.Iterator(film)]
+    assert len(lengths) == 2 * fps and sum(lengths) == 2000
+    assert max(lengths) - min(lengths) <= 10
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows ends a process without asking")
+def test_a_film_that_is_told_to_end_leaves_nothing(tmp_path):
+    small = ["--controllers", "idle", "--scenario", "small", "--size", "160", "120", "--speed", "0.25"]
+    running = subprocess.Popen(
+        [PROGRAM, "watch", *small, "--out", "a.mp4"], cwd=tmp_path, env=HEADLESS, stderr=subprocess.PIPE, text=True
+    )
+    end = time.monotonic() + 120
+    while not (tmp_path / "a.mp4.part").exists():
+        assert running.poll() is None and time.monotonic() < end
+        time.sleep(0.02)
+    running.terminate()
+    assert running.communicate(timeout=60)[1] == ""
+    assert running.returncode == 128 + signal.SIGTERM
+    assert os.listdir(tmp_path) == []
 
 
 def test_the_last_picture_of_a_film(tmp_path):
@@ -125,7 +153,9 @@ def test_without_pygame(monkeypatch, capsys):
     [
         (["--out", "film.avi"], "film.avi: a film ends in .mp4 or .gif (given: '.avi')"),
         (["--out", "film"], "(given: 'no ending')"),
-        (["--out", "nowhere/film.mp4"], "no such folder"),
+        (["--out", "nowhere/film.mp4"], "film cannot be written: no such folder: 'nowhere'"),
+        (["--out", "nowhere/end.png"], "picture cannot be written: no such folder: 'nowhere'"),
+        (["--replay", "a.npz", "--out", "nowhere/a.html"], "page cannot be written: no such folder: 'nowhere'"),
         (["--out", "film.gif", "--fps", "200"], "fps: must be from 1 to 50"),
         (["--controllers", "wolf"], "controllers: 'wolf' is unknown"),
         (["--controllers", "a", "b", "c"], "controllers: one or two side by side (given: 3)"),
@@ -155,6 +185,15 @@ def test_bad_input_is_one_line(words, message, monkeypatch, capsys, tmp_path):
     assert said.out == "" and said.err.count("\n") == 1
     assert said.err.startswith("shepherd-phys watch: ") and message in said.err
     assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize("name", ["folder.png", "folder.mp4"])
+def test_a_folder_in_the_way_is_told_before_anything_is_run(name, monkeypatch, capsys, tmp_path):
+    (tmp_path / name).mkdir()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(watch, "make_player", None)
+    assert main(["watch", "--out", name]) == 2
+    assert f"cannot be written: a folder is in its place: '{name}'\n" in capsys.readouterr().err
 
 
 def test_a_controller_that_fails_leaves_no_film(tmp_path):
