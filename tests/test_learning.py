@@ -447,6 +447,19 @@ def test_channels_follow_from_the_scenario_unless_they_are_given(lidar, channels
     assert load_preset(tmp_path / "mine.toml").lidar.channels == THREE
 
 
+def test_channels_follow_from_all_scenarios_of_a_preset(tmp_path):
+    assert Preset(scenarios=("paper", "fence")).lidar.channels == CHANNELS
+    (tmp_path / "mine.toml").write_text('scenarios = ["corridor"]\n[lidar]\nsectors = 32\n')
+    preset = load_preset(tmp_path / "mine.toml")
+    assert (preset.lidar.channels, preset.lidar.sectors) == (CHANNELS, 32)
+    assert preset.but(scenarios=("paper",)).lidar.channels == THREE
+    assert Preset().but(scenarios=("fence",), scenario=SCENARIOS["small"]).lidar.channels == CHANNELS
+    assert preset.but(lidar=Lidar(sectors=64)).but(scenarios=("fence", "paper")).lidar.channels == THREE
+    for wrong in ([["fence"]], "fence", 5, None):
+        with pytest.raises(SettingsError, match="scenarios"):
+            Preset.from_dict({"scenarios": wrong, "lidar": {}})
+
+
 def test_channels_follow_from_another_scenario():
     walled = SCENARIOS["small"].but(obstacles=(Pillar(center=(8.0, 0.0), radius=1.0),))
     assert Preset(scenario=walled).lidar == Preset().lidar.but(channels=CHANNELS)

@@ -31,7 +31,7 @@ from shepherd_phys.envs.rewards import (
     from_table,
     to_table,
 )
-from shepherd_phys.lidar import Lidar
+from shepherd_phys.lidar import Channel, Lidar
 from shepherd_phys.mirror import Side, check
 from shepherd_phys.scenario import SCENARIOS, Scenario
 from shepherd_phys.settings import Foreign, Settings, SettingsError, read_toml, settings, write_toml
@@ -198,12 +198,8 @@ class Preset(Settings):
     threads: int = Field(default=1, ge=1, le=1024)
     """Of torch. With one, a resumed run equals the unbroken one bit for bit."""
     scenario: Scenario = Scenario()
-    lidar: Lidar = Field(
-        default_factory=lambda given: Lidar(
-            channels=given.get("scenario", Scenario()).channels, sectors=64, frame="goal"
-        )
-    )
-    """Its channels follow from the scenario where nobody gives them."""
+    lidar: Lidar = Field(default_factory=lambda given: Lidar(channels=_channels(**given), sectors=64, frame="goal"))
+    """Its channels follow from the scenario and the scenarios where nobody gives them."""
     network: SectorNetwork = SectorNetwork()
     critic: CriticNetwork = CriticNetwork()
     ppo: PPOSettings = PPOSettings()
@@ -266,15 +262,14 @@ class Preset(Settings):
                 raise ValueError(f"{fields}: {number} {what}; at most {most}")
 
     def but(self, **changes: Any) -> Self:
-        """A validated copy with ``changes``; channels that followed from the scenario follow from another one, too.
+        """A validated copy with ``changes``; channels that followed from the scenarios follow from others, too.
 
         Raises:
             SettingsError: a field is unknown or its value impossible.
         """
-        scenario = changes.get("scenario")
-        followed = self.lidar.channels == self.scenario.channels
-        if followed and isinstance(scenario, Scenario) and "lidar" not in changes:
-            changes["lidar"] = self.lidar.but(channels=scenario.channels)
+        own = {"scenario": self.scenario, "scenarios": self.scenarios}
+        if "lidar" not in changes and self.lidar.channels == _channels(**own):
+            changes["lidar"] = self.lidar.but(channels=_channels(**{**own, **changes}))
         return super().but(**changes)
 
     @property
@@ -404,7 +399,7 @@ class Preset(Settings):
                     raise SettingsError(f"Preset.{name}: must be a table (given: {values[name]!r})")
                 own = values[name]
                 if name == "lidar":  # by now the scenario has been made
-                    own = {"channels": values.get("scenario", Scenario()).channels, **own}
+                    own = {"channels": _channels(**values), **own}
                 values[name] = made(own)
         return cls(**values)
 
@@ -420,6 +415,14 @@ class Preset(Settings):
     def to_toml(self, path: str | Path) -> None:
         """Write the preset as a TOML file."""
         write_toml(self.to_dict(), path)
+
+
+def _channels(scenario: Any = None, scenarios: Any = (), **_: Any) -> tuple[Channel, ...]:
+    """Of a lidar that sees all there may be in the scenarios of a preset; what is no scenario is refused elsewhere."""
+    listed = scenarios if isinstance(scenarios, list | tuple) else ()
+    named = [SCENARIOS[name] for name in listed if isinstance(name, str) and name in SCENARIOS]
+    every = [scenario if isinstance(scenario, Scenario) else Scenario(), *named]
+    return max((one.channels for one in every), key=len)
 
 
 PARTS: dict[str, Callable[[Mapping[str, Any]], Any]] = {
