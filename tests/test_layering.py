@@ -25,6 +25,7 @@ ORDER = (
     ("flock", "lidar"),
     ("imperfections", "mirror"),
     ("scenario",),
+    ("stage",),
     ("world",),
     ("canvas", "cluster", "ledger", "replay"),
     ("campaign", "camera", "outlines", "replay_file"),
