@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from shepherd_phys import mirror
 from shepherd_phys.imperfections import Sight
-from shepherd_phys.lidar import Lidar, Scan, Stack, turn
+from shepherd_phys.lidar import Lidar, Scan
 from shepherd_phys.mirror import Side
+from shepherd_phys.observation import Stack, turn
 from shepherd_phys.scenario import Scenario
 from shepherd_phys.settings import SettingsError
 from shepherd_phys.state import WorldState

@@ -23,6 +23,7 @@ ORDER = (
     ("placement", "avoidance"),
     ("layouts",),
     ("flock", "lidar"),
+    ("observation",),
     ("imperfections", "mirror"),
     ("scenario",),
     ("stage",),
