@@ -1,11 +1,7 @@
 """The paper's two experiments and its claims, as tests on rows of ``episodes.csv`` and of ``figure1.csv``.
 
-A claim has parts, each a number with its 95 % bootstrap interval and the side on which it is claimed to lie. A part
-**holds** when its interval lies wholly on that side, **fails** when it lies wholly on the other, and is **undecided**
-otherwise, or where the trials that it needs were not all run. A claim holds when all its parts hold and fails when one
-fails.
-
-Which claims there are: "Perception-Based Rewards for Robotic Shepherd Teams Maneuvering Split Flocks", section 4.
+Which claims there are: "Perception-Based Rewards for Robotic Shepherd Teams Maneuvering Split Flocks", section 4. When
+one holds: `shepherd_phys.controllers.verdicts`.
 """
 
 from __future__ import annotations
@@ -18,13 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .curves import WINDOW, Curve, curve_of, later_by, levels_off_at
+from .curves import WINDOW, Curve, curve_of, later_by
 from .summary import correlation, intervals
+from .verdicts import At, Claim, Part, Side
 
 Floats = NDArray[np.float64]
 Row = Mapping[str, Any]
-At = tuple[int, int]
-"""A point of the experiments: (flocks, n), with n the neighbours in a sheep's cohesion."""
 
 HEURISTICS = ("strombom", "pierson", "elfiqi", "occlusion")
 """Tuned heuristics: the rivals of c4 and c5."""
@@ -40,8 +35,6 @@ RECIPE, PAPERS_RECIPE = "fast", "paper"
 """Training recipes that c8 is about: ours, and the paper's, which is reported beside it where it was run."""
 LEAST_SEEDS = 3
 """Runs of a scheme below which c8 is not judged: too few have no interval worth the name."""
-
-HOLDS, FAILS, UNDECIDED = "holds", "fails", "undecided"
 
 
 @dataclass(frozen=True)
@@ -72,117 +65,6 @@ EXPERIMENTS = {
 }
 FLOCKS, COHESION = EXPERIMENTS["figure2"].points, EXPERIMENTS["figure3"].points
 EVERYWHERE = tuple(dict.fromkeys((*FLOCKS, *COHESION)))
-
-
-@dataclass(frozen=True)
-class Side:
-    """The claimed side: numbers from ``least`` to ``most``, these two included unless ``strict``."""
-
-    least: float = -math.inf
-    most: float = math.inf
-    strict: bool = False
-
-    def verdict(self, low: float, high: float) -> str:
-        """What the interval from ``low`` to ``high`` says; nothing where an end is not a number."""
-        if math.isnan(low) or math.isnan(high):
-            return UNDECIDED
-        if self._holds(low) and self._holds(high):
-            return HOLDS
-        if high < self.least or low > self.most or (self.strict and (high == self.least or low == self.most)):
-            return FAILS
-        return UNDECIDED
-
-    def _holds(self, number: float) -> bool:
-        return self.least < number < self.most if self.strict else self.least <= number <= self.most
-
-    def __str__(self) -> str:
-        if math.isinf(self.most):
-            return f"{'>' if self.strict else '≥'} {self.least:g}"
-        if math.isinf(self.least):
-            return f"{'<' if self.strict else '≤'} {self.most:g}"
-        return f"{self.least:g} to {self.most:g}"
-
-
-@dataclass(frozen=True)
-class Part:
-    """One number that a claim is about, or the note why there is none."""
-
-    method: str
-    side: Side
-    rival: str | None = None
-    at: At | None = None
-    """None: over all n of figure 3."""
-    value: float | None = None
-    low: float | None = None
-    high: float | None = None
-    counts: bool = True
-    """Whether the claim is about it; otherwise it is reported beside."""
-    note: str = ""
-    recipe: str | None = None
-    """Of the training that it is about, where it is about training."""
-    budget: float | None = None
-    """Shepherd-steps of that training."""
-
-    @property
-    def verdict(self) -> str:
-        """Holds, fails or undecided."""
-        if self.value is None or self.low is None or self.high is None:
-            return UNDECIDED
-        return self.side.verdict(self.low, self.high)
-
-    def to_dict(self) -> dict[str, Any]:
-        """As plain data; ends at infinity, of the interval and of the side, are None."""
-        flocks, n = self.at or (None, None)
-        return {
-            "method": self.method,
-            "rival": self.rival,
-            "n_flocks": flocks,
-            "cohesion": n,
-            "value": self.value,
-            "low": _finite(self.low),
-            "high": _finite(self.high),
-            "claimed": str(self.side),
-            "least": _finite(self.side.least),
-            "most": _finite(self.side.most),
-            "verdict": self.verdict,
-            "counts": self.counts,
-            "note": self.note,
-            "recipe": self.recipe,
-            "budget": self.budget,
-        }
-
-
-def _finite(number: float | None) -> float | None:
-    return None if number is None or math.isinf(number) else number
-
-
-@dataclass(frozen=True)
-class Claim:
-    """A claim with its parts."""
-
-    name: str
-    text: str
-    statistic: str
-    """What the numbers of its parts are."""
-    parts: tuple[Part, ...]
-
-    @property
-    def verdict(self) -> str:
-        """Fails if a part fails, holds if all hold; parts that do not count aside."""
-        verdicts = [part.verdict for part in self.parts if part.counts]
-        if FAILS in verdicts:
-            return FAILS
-        return HOLDS if verdicts and set(verdicts) == {HOLDS} else UNDECIDED
-
-    def to_dict(self) -> dict[str, Any]:
-        """As plain data."""
-        return {
-            "claim": self.name,
-            "text": self.text,
-            "statistic": self.statistic,
-            "verdict": self.verdict,
-            "parts": [part.to_dict() for part in self.parts],
-        }
 
 
 class Trials:
@@ -324,7 +206,7 @@ def _later(part: Part, curve: Curve, other: Curve) -> Part:
     part = replace(part, budget=float(max(own.steps[-1] for own in (curve, other))))
     later = later_by(curve, other)
     if later.value is None:
-        late = [method for method, own in ((part.method, curve), (part.rival, other)) if levels_off_at(own) is None]
+        late = [name for name, end in zip((part.method, part.rival), later.ends, strict=True) if math.isinf(end)]
         return replace(part, note="neither levels off" if len(late) == 2 else f"{late[0]} does not level off")
     return replace(part, value=later.value / 1e6, low=later.low / 1e6, high=later.high / 1e6)
 

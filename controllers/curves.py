@@ -115,11 +115,16 @@ def steps_at(curve: Curve, at: NDArray[np.intp]) -> Floats:
 class Later(NamedTuple):
     """Shepherd-steps by which one curve levels off later than another."""
 
-    value: float | None
-    """Of the curves as they are; None where one of them has not levelled off."""
+    ends: tuple[float, float]
+    """Shepherd-steps at which the curve and the other level off, as they are; infinity where one does not."""
     low: float
     """Low end of the 95 % bootstrap percentile interval."""
     high: float
+
+    @property
+    def value(self) -> float | None:
+        """Of the curves as they are; None where one of them has not levelled off."""
+        return self.ends[0] - self.ends[1] if all(map(math.isfinite, self.ends)) else None
 
 
 def later_by(curve: Curve, other: Curve) -> Later:
@@ -148,7 +153,7 @@ def later_by(curve: Curve, other: Curve) -> Later:
     # no interpolation: between a number and infinity there is nothing
     low = np.percentile(np.where(known, later, -math.inf)[1:], tail, method="lower")
     high = np.percentile(np.where(known, later, math.inf)[1:], 100.0 - tail, method="higher")
-    return Later(float(later[0]) if known[0] else None, float(low), float(high))
+    return Later((float(ends[0][0]), float(ends[1][0])), float(low), float(high))
 
 
 def levels_off_at(curve: Curve) -> float | None:

@@ -13,7 +13,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from shepherd_phys import mirror
-from shepherd_phys.lidar import Lidar, beam_directions, observe
+from shepherd_phys.lidar import Lidar, beam_directions
+from shepherd_phys.observation import observe
 from shepherd_phys.state import WorldState
 
 from .network import Actor
@@ -111,7 +112,7 @@ def _wanted(actions, offset, directions, rest):  # type: ignore[no-untyped-def]
     """Actions (P, 2) of a network as the world takes them.
 
     Clipped to [-1, 1], as while learning, and to the unit disc, as the world does; 0 where shorter than ``rest``;
-    turned by the angle of beam ``offset`` (P,), as `shepherd_phys.lidar.turn` does.
+    turned by the angle of beam ``offset`` (P,), as `shepherd_phys.observation.turn` does.
     """
     wanted = np.empty(actions.shape)
     for p in range(len(actions)):

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from shepherd_phys import mirror
 from shepherd_phys.imperfections import Sight
-from shepherd_phys.lidar import Lidar, Scan, Stack, turn
+from shepherd_phys.lidar import Lidar, Scan
 from shepherd_phys.mirror import Side
+from shepherd_phys.observation import Stack, turn
 from shepherd_phys.scenario import Scenario
 from shepherd_phys.settings import SettingsError
 from shepherd_phys.state import WorldState
@@ -141,13 +142,13 @@ class TeamWorld:
         self.clock = self.decisions = 0
         self.returns = np.zeros(self.n_shepherds)
         self.beam_offset = np.zeros(self.n_shepherds, dtype=np.int64)
-        self.mirrored: NDArray[np.bool_] | None = None
+        self.mirrored = np.zeros(self.n_shepherds, dtype=np.bool_)
         self._held.reset()
         self._held(self.state, measures(self.state)["is_success"])
         self._stack.reset()
         self._sight = Sight(self._plan.lidar, self.scenario.imperfections, self.world.sensing_rng)
         self._look()
-        self._observe()
+        self._observe(first=True)
 
     def decide(self, actions: NDArray[np.float32]) -> Ending | None:
         """Hold wanted velocities for a decision; rewards and observation are written in place.
@@ -160,7 +161,7 @@ class TeamWorld:
         """
         plan, world, scenario = self._plan, self.world, self.scenario
         goal_frame = plan.lidar.frame == "goal"
-        if self.mirrored is not None:
+        if plan.mirror != "never":
             actions = mirror.meant(actions, self.mirrored)
         action = turn(actions, self.beam_offset, plan.lidar.beams) if goal_frame else actions
         first = world.state.step
@@ -209,19 +210,18 @@ class TeamWorld:
         self._stack.push(self._sight.frame(scan))
         return scan
 
-    def _observe(self) -> None:
-        """Write what the shepherds see."""
+    def _observe(self, first: bool = False) -> None:
+        """Write what the shepherds see; the first time in an episode it is found out who sees it in a mirror."""
         lidar = self._plan.lidar
         seen, self.beam_offset = self._stack.observe(self.beam_offset)
         if self._plan.mirror != "never":
-            if self.mirrored is None:
+            if first:
                 self.mirrored = mirror.mirrored(self._plan.mirror, seen, lidar)
             seen = mirror.seen(seen, self.mirrored)
         self.observation["lidar"][:] = seen
         if self._plan.critic:
             angle = np.multiply(self.beam_offset, 2.0 * np.pi / lidar.beams, dtype=np.float64)
-            who = np.zeros(self.n_shepherds, np.bool_) if self.mirrored is None else self.mirrored
-            whole_world(self.state, angle, who, self.observation["critic"])
+            whole_world(self.state, angle, self.mirrored, self.observation["critic"])
 
     def render(self, size: tuple[int, int] = (320, 320)) -> NDArray[np.uint8]:
         """A picture (height, width, 3) of the state."""

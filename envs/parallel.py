@@ -11,7 +11,8 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
-from shepherd_phys.lidar import Lidar, turn
+from shepherd_phys.lidar import Lidar
+from shepherd_phys.observation import turn
 from shepherd_phys.scenario import Scenario
 from shepherd_phys.settings import SettingsError
 from shepherd_phys.state import WorldState

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from shepherd_phys.camera import Smooth
 from shepherd_phys.imperfections import Sight
-from shepherd_phys.lidar import Lidar, Scan, Stack
+from shepherd_phys.lidar import Lidar, Scan
+from shepherd_phys.observation import Stack
 from shepherd_phys.overlays import Corner
 from shepherd_phys.palette import THEMES
 from shepherd_phys.scenario import Scenario, load_scenario

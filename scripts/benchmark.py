@@ -26,7 +26,8 @@ from shepherd_phys.controllers.evaluation import ControllerError, run_episode, t
 from shepherd_phys.controllers.strombom import StrombomSettings, StrombomTeam
 from shepherd_phys.envs import ShepherdingEnv
 from shepherd_phys.flock import Strombom
-from shepherd_phys.lidar import Lidar, Stack, encode
+from shepherd_phys.lidar import Lidar
+from shepherd_phys.observation import Stack, encode
 from shepherd_phys.scenario import Scenario
 from shepherd_phys.settings import SettingsError
 from shepherd_phys.state import WorldState

@@ -136,8 +136,8 @@ def run_study(name: str, folder: Path, *, controllers: Sequence[str], reported: 
         reported: the trials.
 
     Raises:
-        SettingsError, ControllerError: a controller is unknown or none; or the folder is another campaign's.
-        CampaignError: the ledger is not to be had, no worker can be started, or a file cannot be written.
+        SettingsError, ControllerError: a controller is unknown or none; or the ledger is not to be had.
+        CampaignError: no worker can be started, or a file cannot be written.
     """
     from .figures import draw_cases
 

@@ -11,22 +11,19 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TextIO
 
-import numpy as np
 import tyro
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from shepherd_phys import __version__, campaign
-from shepherd_phys.campaign import CampaignError, Ledger
-from shepherd_phys.controllers.evaluation import LABELS, ControllerError, trial_seed
-from shepherd_phys.envs.shepherding import ShepherdingEnv
-from shepherd_phys.scenario import SCENARIOS
+from shepherd_phys import campaign
+from shepherd_phys.controllers.evaluation import LABELS, trial_seed
 from shepherd_phys.settings import SettingsError, read_toml
 
-from .command import at_least, cpu_count, fail, flag, parsed, progress_bar, workforce
+from .campaigns import ended, lost, opened
+from .command import at_least, cpu_count, fail, flag, parsed, workforce
 from .pictures import picture
-from .points import episode, place, points, table, tasks, write_tables
+from .points import episode, points, table, tasks, write_tables
 from .replays import missing, open_folder, record_again, recorded_episode
 
 PROG = "shepherd-phys evaluate"
@@ -97,48 +94,26 @@ def main(argv: Sequence[str]) -> int:
         return fail(PROG, error, 2)
     out = sys.stdout
     with contextlib.redirect_stdout(sys.stderr):  # a user's classes may print wherever they are touched
-        return _main(options, out)
+        return ended(PROG, options.out, lambda: _main(options, out))
 
 
 def _main(options: Evaluate, out: TextIO) -> int:
-    try:
-        part, count = read_shard(options.shard)
-        grid = points(**{name: getattr(options, name) for name in POINT_KEYS})
-        seeds = [trial_seed(options.seed, trial) for trial in range(options.trials)]
-        todo = campaign.shard(tasks(grid, seeds), part, count)
-    except (SettingsError, ControllerError) as error:
-        return fail(PROG, error, 2)
-    replays: Path | None = None
-    with progress_bar() as report:
-        try:
-            if options.save_replay is not None:
-                replays = open_folder(options.save_replay)
-            ledger = ready(options.out, todo, options.gather)
-        except (SettingsError, CampaignError) as error:
-            return fail(PROG, error, 2)
-        with ledger:
-            how: dict[str, Any] = {
-                "workers": workforce(PROG, options.workers, options.scheduler),
-                "timeout": options.timeout,
-                "report": report,
-            }
-            try:
-                work = episode if replays is None else partial(recorded_episode, str(replays))
-                outcome = campaign.run(todo, work, ledger=ledger, **how)
-                failures = list(outcome.failures)
-                if replays is not None:
-                    kept = {task.key: row for task, row in zip(todo, outcome.rows, strict=True) if row is not None}
-                    again = missing(replays, [task for task in todo if task.key in kept])
-                    failures += record_again(replays, again, [kept[task.key] for task in again], **how)
-                summary, paths = write_tables(options.out, table(todo, outcome), options.baseline)
-                if todo and outcome.rows[0] is not None:
-                    paths += picture(todo[0], ledger, PROG)
-            except CampaignError as error:
-                return fail(PROG, error, 1)
-            except KeyboardInterrupt:
-                return fail(
-                    PROG, f"stopped; what was finished is kept in {ledger.path}: the same command continues", 130
-                )
+    part, count = read_shard(options.shard)
+    grid = points(**{name: getattr(options, name) for name in POINT_KEYS})
+    seeds = [trial_seed(options.seed, trial) for trial in range(options.trials)]
+    todo = campaign.shard(tasks(grid, seeds), part, count)
+    replays = None if options.save_replay is None else open_folder(options.save_replay)
+    workers = workforce(PROG, options.workers, options.scheduler)
+    with opened(options.out, todo, workers=workers, timeout=options.timeout, gather=options.gather) as ours:
+        outcome = ours.run(todo, episode if replays is None else partial(recorded_episode, str(replays)))
+        failures = list(outcome.failures)
+        if replays is not None:
+            kept = {task.key: row for task, row in zip(todo, outcome.rows, strict=True) if row is not None}
+            again = missing(replays, [task for task in todo if task.key in kept])
+            failures += record_again(replays, again, [kept[task.key] for task in again], **ours.how)
+        summary, paths = write_tables(options.out, table(todo, outcome), options.baseline)
+        if todo and outcome.rows[0] is not None:
+            paths += picture(todo[0], ours.ledger, PROG)
     if options.json:
         print(json.dumps(summary, allow_nan=False, indent=1), file=out)
     else:
@@ -146,57 +121,14 @@ def _main(options: Evaluate, out: TextIO) -> int:
         print_differences(summary, out)
     for path in paths:
         print(path, file=sys.stderr if options.json else out)
-    lost = 0 if replays is None else len(missing(replays, todo))
+    unrecorded = 0 if replays is None else len(missing(replays, todo))
     if replays is not None:
-        print(f"{len(todo) - lost} replays in {options.save_replay}", file=sys.stderr if options.json else out)
-        if lost > len(failures):
-            print(f"{PROG}: {lost} are not there: workers of a cluster must share that folder", file=sys.stderr)
-    for failure in failures:
-        print(f"{PROG}: no result in {failure.attempts} attempts: {failure}", file=sys.stderr)
-    return 1 if failures or lost else 0
-
-
-def ready(folder: Path, todo: Sequence[campaign.Task], sources: Sequence[Path] = ()) -> Ledger:
-    """The folder's ledger with what other folders have, when what is still to be run has been rehearsed.
-
-    Raises:
-        SettingsError: no world can be placed for a point. No folder has been made then.
-        CampaignError: the folder is not to be had, or nothing can be gathered from a source.
-    """
-    taken = campaign.gathered(sources, __version__, todo)
-    if sources:
-        print(f"gathered {len(taken)} of {len(todo)} episodes", file=sys.stderr)
-    is_new = not (folder / campaign.LEDGER).exists()
-    if is_new:
-        rehearse([task for task in todo if task.key not in taken])
-    ledger = Ledger(folder, __version__)
-    try:
-        ledger.take(taken)
-        if not is_new:
-            kept = ledger.rows(task.settings_hash for task in todo)
-            rehearse([task for task in todo if task.key not in kept])
-    except BaseException:
-        ledger.close()
-        raise
-    return ledger
-
-
-def rehearse(todo: Sequence[campaign.Task]) -> None:
-    """Find out once, and not by every episode's failing, what can be known before; compile before workers start.
-
-    Raises:
-        SettingsError: no world can be placed for a point (on three of its seeds; one may be bad luck).
-    """
-    if not todo:
-        return
-    env = ShepherdingEnv(SCENARIOS["small"], rewards={}, lidar=None)
-    env.reset(seed=0)
-    env.step(np.zeros((env.scenario.n_shepherds, 2)))  # compiled code is kept on disk: workers find it there
-    seeds: dict[str, list[int]] = {}
-    for task in todo:
-        seeds.setdefault(task.settings_hash, []).append(task.seed)
-    for task in {task.settings_hash: task for task in todo}.values():
-        place(task.spec, seeds[task.settings_hash][:3])
+        print(f"{len(todo) - unrecorded} replays in {options.save_replay}", file=sys.stderr if options.json else out)
+        if unrecorded > len(failures):
+            print(f"{PROG}: {unrecorded} are not there: workers of a cluster must share that folder", file=sys.stderr)
+    for line in lost(failures):
+        print(f"{PROG}: {line}", file=sys.stderr)
+    return 1 if failures or unrecorded else 0
 
 
 def read_options(argv: Sequence[str]) -> Evaluate:

@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from shepherd_phys import __version__, campaign
-from shepherd_phys.campaign import CampaignError, Failure, Ledger, Task
+from shepherd_phys.campaign import Failure, Ledger, Task
 from shepherd_phys.controllers.recording import recorded
 from shepherd_phys.envs.shepherding import ShepherdingEnv
 from shepherd_phys.replay_file import save_replay
+from shepherd_phys.settings import SettingsError
 
 from .points import Point, find_controller
 
@@ -52,14 +53,14 @@ def open_folder(folder: Path) -> Path:
     """The folder, made if missing, by its whole path: workers of a cluster may stand elsewhere.
 
     Raises:
-        CampaignError: it cannot be made.
+        SettingsError: it cannot be made.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        raise CampaignError(f"save-replay: {folder}: cannot be made or written ({error.strerror})") from None
+        raise SettingsError(f"save-replay: {folder}: cannot be made or written ({error.strerror})") from None
     return folder.absolute()
 
 

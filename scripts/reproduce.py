@@ -17,20 +17,21 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from shepherd_phys import __version__, campaign
-from shepherd_phys.campaign import CampaignError, Ledger, Outcome, Task, remove, write_bytes, write_csv
+from shepherd_phys import __version__
+from shepherd_phys.campaign import Ledger, Outcome, Task, remove, write_bytes, write_csv
 from shepherd_phys.controllers import CONTROLLERS
 from shepherd_phys.controllers.claims import EXPERIMENTS, HEURISTICS, LEARNED, LITERAL, judge
-from shepherd_phys.controllers.evaluation import COLUMNS, ControllerError, trial_seed
+from shepherd_phys.controllers.evaluation import COLUMNS, trial_seed
 from shepherd_phys.controllers.summary import summarise, summary_columns
 from shepherd_phys.settings import SettingsError
 
 from . import studies
 from .beyond import STUDIES, run_study
-from .command import at_least, cpu_count, fail, flag, parsed, progress_bar, workforce
-from .evaluate import print_table, ready
+from .campaigns import ended, lost, opened
+from .command import at_least, cpu_count, fail, flag, parsed, workforce
+from .evaluate import print_table
 from .pages import PART_HEAD, claims_page, few_trials, figure_page, part_cells
-from .points import episode, points, table, tasks
+from .points import points, table, tasks
 
 PROG = "shepherd-phys reproduce"
 SCENARIO = "paper"
@@ -100,92 +101,66 @@ def main(argv: Sequence[str]) -> int:
         return fail(PROG, error, 2)
     out = sys.stdout
     with contextlib.redirect_stdout(sys.stderr):  # a user's classes may print wherever they are touched
-        return _main(options, out) if options.figure in EPISODES else study(options, out)
+        return ended(PROG, options.out, lambda: (figures if options.figure in EPISODES else study)(options, out))
 
 
 def study(options: Reproduce, out: TextIO) -> int:
-    """Run what is no figure of episodes; the exit status as of `main`."""
+    """Run what is no figure of episodes; the exit status."""
     figure, folder = options.figure, options.out
-    try:
-        reported = studies.Reported(SCENARIO, options.trials, options.seed, options.workers, options.timeout)
-        check_drawing()
-        if figure in STUDIES:
-            result = run_study(figure, folder, controllers=options.controllers, reported=reported)
+    reported = studies.Reported(SCENARIO, options.trials, options.seed, options.workers, options.timeout)
+    check_drawing()
+    if figure in STUDIES:
+        result = run_study(figure, folder, controllers=options.controllers, reported=reported)
+    else:
+        how: dict[str, Any] = {
+            "n_seeds": options.seeds or studies.SEEDS[figure],
+            "budget": options.budget or studies.BUDGETS[figure],
+            "workers": options.workers,
+        }
+        if figure == "ablations":
+            result = studies.ablations(folder, **how)
         else:
-            how: dict[str, Any] = {
-                "n_seeds": options.seeds or studies.SEEDS[figure],
-                "budget": options.budget or studies.BUDGETS[figure],
-                "workers": options.workers,
-            }
-            if figure == "ablations":
-                result = studies.ablations(folder, **how)
-            else:
-                result = studies.figure1(folder, **how, paper_hours=options.paper_hours, reported=reported)
-    except (SettingsError, ControllerError) as error:
-        return fail(PROG, error, 2)
-    except CampaignError as error:
-        return fail(PROG, error, 1)
-    except KeyboardInterrupt:
-        return fail(PROG, f"stopped; what was done is kept in {folder}: the same command continues", 130)
+            result = studies.figure1(folder, **how, paper_hours=options.paper_hours, reported=reported)
     print(json.dumps(result.tables, allow_nan=False, indent=1) if options.json else result.page, file=out)
-    for path in result.paths:
-        print(path, file=sys.stderr if options.json else out)
-    for failure in result.failures:
-        print(f"{PROG}: {failure}", file=sys.stderr)
-    return 1 if result.failures else 0
+    return _close(options, result.paths, result.failures, out)
 
 
-def _main(options: Reproduce, out: TextIO) -> int:
+def figures(options: Reproduce, out: TextIO) -> int:
+    """Run the figures of episodes, and judge the claims; the exit status."""
     asked = list(EXPERIMENTS) if options.figure == "all" else [options.figure]
     methods = roster(options.controllers, options.literal)
     seeds = [trial_seed(options.seed, trial) for trial in range(options.trials)]
-    try:
-        check_drawing()
-        curves = studies.kept_curves(options.out)
-        todo, everything = work(asked, methods, seeds), work(list(EXPERIMENTS), methods, seeds)
-    except (SettingsError, ControllerError) as error:
-        return fail(PROG, error, 2)
-    with progress_bar() as report:
-        try:
-            ledger = ready(options.out, todo, options.gather)
-        except (SettingsError, CampaignError) as error:
-            return fail(PROG, error, 2)
-        with ledger:
-            try:
-                outcome = campaign.run(
-                    todo,
-                    episode,
-                    workers=workforce(PROG, options.workers, options.scheduler),
-                    ledger=ledger,
-                    timeout=options.timeout,
-                    report=report,
-                )
-                rows = table(everything, kept(ledger, everything))
-                summaries = {name: summary_of(name, rows, methods) for name in asked}
-                claims = {
-                    "trials": options.trials,
-                    "seed": options.seed,
-                    "version": __version__,
-                    "claims": [claim.to_dict() for claim in judge(rows, seeds, curves=curves)],
-                }
-                paths = write_files(options.out, rows, summaries, claims)
-            except CampaignError as error:
-                return fail(PROG, error, 1)
-            except KeyboardInterrupt:
-                return fail(
-                    PROG, f"stopped; what was finished is kept in {ledger.path}: the same command continues", 130
-                )
+    check_drawing()
+    curves = studies.kept_curves(options.out)
+    todo, everything = work(asked, methods, seeds), work(list(EXPERIMENTS), methods, seeds)
+    workers = workforce(PROG, options.workers, options.scheduler)
+    with opened(options.out, todo, workers=workers, timeout=options.timeout, gather=options.gather) as ours:
+        outcome = ours.run(todo)
+        rows = table(everything, kept(ours.ledger, everything))
+        summaries = {name: summary_of(name, rows, methods) for name in asked}
+        claims = {
+            "trials": options.trials,
+            "seed": options.seed,
+            "version": __version__,
+            "claims": [claim.to_dict() for claim in judge(rows, seeds, curves=curves)],
+        }
+        paths = write_files(options.out, rows, summaries, claims)
     if options.json:
         print(json.dumps({**summaries, "claims": claims}, allow_nan=False, indent=1), file=out)
     else:
         for summary in summaries.values():
             print_table(summary, out)
         print_claims(claims, out)
+    return _close(options, paths, lost(outcome.failures), out)
+
+
+def _close(options: Reproduce, paths: Sequence[Path], failures: Sequence[str], out: TextIO) -> int:
+    """Name the files written, and what has no result; the exit status."""
     for path in paths:
         print(path, file=sys.stderr if options.json else out)
-    for failure in outcome.failures:
-        print(f"{PROG}: no result in {failure.attempts} attempts: {failure}", file=sys.stderr)
-    return 1 if outcome.failures else 0
+    for failure in failures:
+        print(f"{PROG}: {failure}", file=sys.stderr)
+    return 1 if failures else 0
 
 
 def roster(controllers: Sequence[str], literal: bool) -> list[str]:

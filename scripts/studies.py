@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from shepherd_phys import __version__, campaign
+from shepherd_phys import __version__
 from shepherd_phys.campaign import Outcome, Task, write_bytes, write_csv
 from shepherd_phys.controllers.claims import judge
 from shepherd_phys.controllers.curves import COLUMNS
@@ -20,12 +20,11 @@ from shepherd_phys.learning.folder import FIRST
 from shepherd_phys.learning.studies import HOME, Run
 from shepherd_phys.settings import SettingsError
 
-from .command import progress_bar
+from .campaigns import lost, opened
 from .curves import VALIDATIONS, Row, gather, one_by_one, read_rows, side_by_side, unfinished
-from .evaluate import ready
 from .learning_pages import ablations_page, figure1_page
 from .pages import claims_page
-from .points import episode, points, tasks
+from .points import points, tasks
 from .train import check_libraries
 
 TRAINING = "training"
@@ -69,14 +68,12 @@ class Reported(NamedTuple):
         """Run what the folder's ledger lacks of the tasks: what came of all, and which have no result, and why.
 
         Raises:
-            SettingsError: no world can be placed for a point.
-            CampaignError: the ledger is not to be had, or no worker can be started.
+            SettingsError: no world can be placed for a point, or the ledger is not to be had.
+            CampaignError: the ledger cannot be written, or no worker can be started.
         """
-        with progress_bar() as report, ready(folder, todo) as ledger:
-            outcome = campaign.run(
-                todo, episode, workers=self.workers, ledger=ledger, timeout=self.timeout, report=report
-            )
-        return outcome, [f"no result in {failure.attempts} attempts: {failure}" for failure in outcome.failures]
+        with opened(folder, todo, workers=self.workers, timeout=self.timeout) as ours:
+            outcome = ours.run(todo)
+        return outcome, lost(outcome.failures)
 
 
 def figure1(folder: Path, *, n_seeds: int, budget: int, paper_hours: float, workers: int, reported: Reported) -> Result:
@@ -198,8 +195,8 @@ def confirm(home: Sequence[Row], runs: Sequence[Run], folder: Path, reported: Re
         episodes that have no result, and why.
 
     Raises:
-        SettingsError: a policy cannot be read.
-        CampaignError: the ledger is not to be had, or no worker can be started.
+        SettingsError: a policy cannot be read, or the ledger is not to be had.
+        CampaignError: the ledger cannot be written, or no worker can be started.
     """
     names = {run.preset.seed: str(folder / TRAINING / run.name / FIRST) for run in runs}
     wanted = {(names[row["seed"]], row["n_flocks"]): row for row in home if row["checkpoint"] is not None}

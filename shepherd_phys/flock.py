@@ -179,6 +179,27 @@ def flight(sheep: Floats, shepherds: Floats, r_s: float) -> tuple[NDArray[np.boo
 
 
 @njit(cache=True)
+def grazing(threatened: NDArray[np.bool_], speed: Floats, draws: Floats, p: float) -> Floats:
+    """What sheep wish that nobody threatens: to stand still, but for a step now and then.
+
+    Args:
+        threatened: (N,) these are left at zeros.
+        speed: (N,) [m/s].
+        draws: (N, 2) uniform in [0, 1): whether to step, and the angle over 2 pi.
+        p: probability of a step.
+
+    Returns:
+        (N, 2) v* [m/s].
+    """
+    velocity = np.zeros((len(speed), 2))
+    for i in range(len(speed)):
+        if not threatened[i] and draws[i, 0] < p:
+            angle = 2.0 * math.pi * draws[i, 1]
+            velocity[i, 0], velocity[i, 1] = speed[i] * math.cos(angle), speed[i] * math.sin(angle)
+    return velocity
+
+
+@njit(cache=True)
 def desired(
     sheep: Floats, heading: Floats, speed: Floats, shepherds: Floats, draws: Floats,
     h: float, c: float, rho_a: float, rho_s: float, e: float, r_s: float, r_a: float, n: int, p: float,
@@ -207,18 +228,15 @@ def desired(
     Returns:
         (N, 2) v* [m/s].
     """
-    velocity = np.zeros((len(sheep), 2))
     threatened, away = flight(sheep, shepherds, r_s)
-    if threatened.any():
-        towards, apart = surroundings(sheep, threatened, n, r_a, use_grid, np.empty((0, 0), np.int64))
-    else:
-        towards, apart = away, away
+    velocity = grazing(threatened, speed, draws, p)
+    if not threatened.any():
+        return velocity
+    towards, apart = surroundings(sheep, threatened, n, r_a, use_grid, np.empty((0, 0), np.int64))
     for i in range(len(sheep)):
-        angle = 2.0 * math.pi * draws[i, 1]
         if not threatened[i]:
-            if draws[i, 0] < p:
-                velocity[i, 0], velocity[i, 1] = speed[i] * math.cos(angle), speed[i] * math.sin(angle)
             continue
+        angle = 2.0 * math.pi * draws[i, 1]
         cx, cy = _unit(towards[i, 0], towards[i, 1])
         ax, ay = _unit(apart[i, 0], apart[i, 1])
         sx, sy = _unit(away[i, 0], away[i, 1])
@@ -296,12 +314,8 @@ def boids(
     Returns:
         (N, 2) v* [m/s].
     """
-    velocity = np.zeros((len(sheep), 2))
     threatened, away = flight(sheep, shepherds, r_s)
-    for i in range(len(sheep)):
-        if not threatened[i] and draws[i, 0] < p:
-            angle = 2.0 * math.pi * draws[i, 1]
-            velocity[i, 0], velocity[i, 1] = speed[i] * math.cos(angle), speed[i] * math.sin(angle)
+    velocity = grazing(threatened, speed, draws, p)
     if not threatened.any():
         return velocity
     cells = build(sheep, max(r, r_a)) if use_grid else one_cell(sheep)

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from shepherd_phys.lidar import Lidar, Proximities, Scan, encode
+from shepherd_phys.lidar import Lidar, Scan
+from shepherd_phys.observation import Proximities, encode
 from shepherd_phys.settings import Settings, settings
 from shepherd_phys.state import Floats, frozen
 

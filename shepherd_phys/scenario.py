@@ -22,6 +22,7 @@ from shepherd_phys.settings import (
     Settings,
     SettingsError,
     handed_over,
+    listed,
     read_toml,
     settings,
     tagged,
@@ -58,11 +59,6 @@ def _interval(value: Any) -> Any:
     return value
 
 
-def _listed(value: Any) -> Any:
-    """Files know lists only."""
-    return tuple(value) if isinstance(value, list) else value
-
-
 def _sheep_kinds(value: Any) -> Any:
     """One body, or several."""
     if isinstance(value, list | tuple):
@@ -83,7 +79,7 @@ class Scenario(Settings):
     """N."""
     n_flocks: int = Field(default=2, ge=1)
     """Flocks at the start, of equal size (+-1) where ``flock_sizes`` does not say otherwise."""
-    flock_sizes: Annotated[tuple[Annotated[int, Field(ge=1)], ...], BeforeValidator(_listed)] | None = None
+    flock_sizes: Annotated[tuple[Annotated[int, Field(ge=1)], ...], BeforeValidator(listed)] | None = None
     """Sheep in each flock at the start; none given: equal sizes."""
     flock_distance: Annotated[
         tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]], BeforeValidator(_interval)

@@ -74,6 +74,11 @@ def _brief(value: object) -> str:
     return text if len(text) <= 80 else text[:77] + "..."
 
 
+def listed(value: Any) -> Any:
+    """A list as a tuple, before a field is validated: files know lists only."""
+    return tuple(value) if isinstance(value, list) else value
+
+
 class Settings:
     """Mixin of every settings class: ``but`` for a validated copy, ``to_dict`` for plain data."""
 

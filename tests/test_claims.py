@@ -14,18 +14,15 @@ from shepherd_phys.controllers.claims import (
     COHESION,
     EVERYWHERE,
     EXPERIMENTS,
-    FAILS,
     FLOCKS,
     HEURISTICS,
-    HOLDS,
     LEARNED,
     LITERAL,
-    UNDECIDED,
-    Side,
     Trials,
     judge,
 )
 from shepherd_phys.controllers.summary import correlation, ranks, spearman
+from shepherd_phys.controllers.verdicts import FAILS, HOLDS, UNDECIDED, Side
 
 SEEDS = [41, 7, 1000, 3, 12, 8, 90, 66, 5, 23]
 N = len(SEEDS)

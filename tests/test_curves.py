@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from shepherd_phys.controllers.claims import FAILS, HOLDS, UNDECIDED, judge
+from shepherd_phys.controllers.claims import judge
 from shepherd_phys.controllers.curves import (
     COLUMNS,
     WINDOW,
@@ -18,6 +18,7 @@ from shepherd_phys.controllers.curves import (
     levels_off_at,
     steps_at,
 )
+from shepherd_phys.controllers.verdicts import FAILS, HOLDS, UNDECIDED
 from shepherd_phys.learning.preset import load_preset
 from shepherd_phys.learning.studies import Run, ablations, deciding_every, figure1, variants
 from shepherd_phys.scripts.curves import VALIDATIONS, binned
@@ -202,9 +203,9 @@ def test_the_papers_recipe_is_judged_beside():
 def test_the_interval_is_of_seeds_resampled_apart():
     """Three seeds of wild that level off at 14, 14 and 24 e6, and of any at 34 e6: what resampling can give."""
     curves = study([10, 10, 20], [30, 30, 30])
-    value, low, high = later_by(curve_of(curves, "fast", "any"), curve_of(curves, "fast", "wild"))
+    later = later_by(curve_of(curves, "fast", "any"), curve_of(curves, "fast", "wild"))
     # wild's mean is 0, 2/3, 1 of its end: at the third seed's step it is still outside, unless that seed is not drawn
-    assert (value, low, high) == (10e6, 10e6, 20e6)
+    assert (later.value, later.low, later.high) == (10e6, 10e6, 20e6)
 
 
 # ---- rows -----------------------------------------------------------------------------------------------------------

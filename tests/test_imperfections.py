@@ -14,7 +14,8 @@ from shepherd_phys.envs import ShepherdingEnv
 from shepherd_phys.envs.parallel import ShepherdingParallelEnv
 from shepherd_phys.envs.team import TeamVecEnv
 from shepherd_phys.imperfections import Imperfections, Sight
-from shepherd_phys.lidar import Lidar, Scan, encode
+from shepherd_phys.lidar import Lidar, Scan
+from shepherd_phys.observation import encode
 from shepherd_phys.obstacles import Pillar
 from shepherd_phys.scenario import SCENARIOS, Scenario, load_scenario
 from shepherd_phys.settings import SettingsError

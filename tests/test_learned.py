@@ -34,7 +34,8 @@ from shepherd_phys.controllers.policy_files import (
     write_policy,
 )
 from shepherd_phys.envs import ShepherdingEnv
-from shepherd_phys.lidar import Lidar, observe, turn
+from shepherd_phys.lidar import Lidar
+from shepherd_phys.observation import observe, turn
 from shepherd_phys.scenario import SCENARIOS, Scenario
 from shepherd_phys.scripts.points import find_controller, points
 from shepherd_phys.settings import Foreign, SettingsError

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from shepherd_phys.lidar import CHANNELS, Lidar, Scan, Stack, encode, observe, turn
+from shepherd_phys.lidar import CHANNELS, Lidar, Scan
+from shepherd_phys.observation import Stack, encode, observe, turn
 
 
 def test_proximities_are_hand_worked():

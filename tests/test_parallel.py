@@ -9,7 +9,8 @@ import pytest
 
 from shepherd_phys.envs import WILD, ShepherdingEnv, ShepherdingParallelEnv
 from shepherd_phys.envs.rewards import Effort
-from shepherd_phys.lidar import Lidar, turn
+from shepherd_phys.lidar import Lidar
+from shepherd_phys.observation import turn
 from shepherd_phys.scenario import SCENARIOS
 from shepherd_phys.settings import SettingsError
 

@@ -147,7 +147,7 @@ def shell(words, timeout=300):
 @pytest.fixture
 def in_process(monkeypatch):
     """No worker processes: each takes seconds to start."""
-    monkeypatch.setattr(evaluate.campaign, "run", partial(campaign.run, retries=0))
+    monkeypatch.setattr(campaign, "run", partial(campaign.run, retries=0))
     monkeypatch.setitem(evaluate.LEAST, "workers", 0)
 
 
@@ -438,7 +438,7 @@ def test_ctrl_c_ends_cleanly_and_says_how_to_go_on(folder):
     assert command.returncode == 130
     assert out == ""
     (said,) = mistakes(err)
-    assert said.startswith("shepherd-phys evaluate: stopped; what was finished is kept in results/ledger.sqlite:")
+    assert said.startswith("shepherd-phys evaluate: stopped; what was done is kept in results:")
     with Ledger("results", __version__) as ledger:
         assert ledger._rows.execute("SELECT count(*) FROM episodes").fetchone()[0] > 0
 

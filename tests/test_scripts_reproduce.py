@@ -52,7 +52,7 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.setattr(reproduce, "SCENARIO", "tiny.toml")
-    monkeypatch.setattr(reproduce.campaign, "run", partial(campaign.run, retries=0))
+    monkeypatch.setattr(campaign, "run", partial(campaign.run, retries=0))
     monkeypatch.setitem(reproduce.LEAST, "workers", 0)
     yield tmp_path
     sys.modules.pop("mine", None)
@@ -140,7 +140,7 @@ def test_both_figures_share_what_they_share(folder, capsys):
         computed.append(outcome.computed)
         return outcome
 
-    reproduce.campaign.run = watched  # the fixture puts the original back
+    campaign.run = watched  # the fixture puts the original back
     assert run("figure3", "--controllers", "idle") == 0
     assert computed == [5 * 2]
     assert {name: contents()[name] for name in FIGURE_2} == {name: first[name] for name in FIGURE_2}

@@ -16,7 +16,8 @@ from shepherd_phys.envs import WILD, ShepherdingEnv
 from shepherd_phys.envs import _critic as critic
 from shepherd_phys.envs.rewards import Effort
 from shepherd_phys.envs.team import TeamVecEnv
-from shepherd_phys.lidar import Lidar, turn
+from shepherd_phys.lidar import Lidar
+from shepherd_phys.observation import turn
 from shepherd_phys.obstacles import Pillar
 from shepherd_phys.scenario import SCENARIOS
 from shepherd_phys.settings import SettingsError

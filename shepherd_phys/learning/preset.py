@@ -34,7 +34,7 @@ from shepherd_phys.envs.rewards import (
 from shepherd_phys.lidar import Channel, Lidar
 from shepherd_phys.mirror import Side, check
 from shepherd_phys.scenario import SCENARIOS, Scenario
-from shepherd_phys.settings import Foreign, Settings, SettingsError, read_toml, settings, write_toml
+from shepherd_phys.settings import Foreign, Settings, SettingsError, listed, read_toml, settings, write_toml
 
 FOLDER = Path(__file__).parent / "presets"
 MOST_NUMBERS = 2**32
@@ -47,18 +47,14 @@ MOST_EPISODES = 1_000_000
 """Of a validation."""
 
 
-def _listed(value: Any) -> Any:
-    return tuple(value) if isinstance(value, list) else value
-
-
 # bounds are far above what anybody trains, and below what no machine holds: a slip costs an error, not the memory
 Count = Annotated[int, Field(ge=1, le=10_000)]
-Counts = Annotated[tuple[Count, ...], Field(min_length=1, max_length=10_000), BeforeValidator(_listed)]
-Range = Annotated[tuple[Count, Count], BeforeValidator(_listed)]
+Counts = Annotated[tuple[Count, ...], Field(min_length=1, max_length=10_000), BeforeValidator(listed)]
+Range = Annotated[tuple[Count, Count], BeforeValidator(listed)]
 Length = Annotated[float, Field(ge=0)]
-Span = Annotated[tuple[Length, Length], BeforeValidator(_listed)]
+Span = Annotated[tuple[Length, Length], BeforeValidator(listed)]
 Fractions = Annotated[
-    tuple[Annotated[float, Field(ge=0, le=0.5)], Annotated[float, Field(ge=0, le=0.5)]], BeforeValidator(_listed)
+    tuple[Annotated[float, Field(ge=0, le=0.5)], Annotated[float, Field(ge=0, le=0.5)]], BeforeValidator(listed)
 ]
 
 
@@ -181,7 +177,7 @@ class Preset(Settings):
     """Least and largest distance of a flock's centre from the goal's while learning [m]; none: the scenario's."""
     uneven: float = Field(default=0.0, ge=0, le=1)
     """Fraction of the episodes whose flocks differ in size."""
-    scenarios: Annotated[tuple[str, ...], BeforeValidator(_listed)] = ()
+    scenarios: Annotated[tuple[str, ...], BeforeValidator(listed)] = ()
     """Names of scenarios. Each episode while learning is in the scenario or in one of these, all with the same
     probability. Validation is in the scenario."""
     density: Fractions | None = None
@@ -419,8 +415,8 @@ class Preset(Settings):
 
 def _channels(scenario: Any = None, scenarios: Any = (), **_: Any) -> tuple[Channel, ...]:
     """Of a lidar that sees all there may be in the scenarios of a preset; what is no scenario is refused elsewhere."""
-    listed = scenarios if isinstance(scenarios, list | tuple) else ()
-    named = [SCENARIOS[name] for name in listed if isinstance(name, str) and name in SCENARIOS]
+    texts = scenarios if isinstance(scenarios, list | tuple) else ()
+    named = [SCENARIOS[name] for name in texts if isinstance(name, str) and name in SCENARIOS]
     every = [scenario if isinstance(scenario, Scenario) else Scenario(), *named]
     return max((one.channels for one in every), key=len)
 
