@@ -154,7 +154,9 @@ def draw_cases(summary: Sequence[Mapping[str, Any]]) -> bytes:
                 axes.axhline(border + 0.5, color="#eeeeee", linewidth=0.8)
         left.set_xlim(-4.0, 104.0)
         right.set_xlim(left=0.0)
-        left.set_yticks(range(len(cases)), ["\n".join(textwrap.wrap(case, 26)) for case in cases])
+        # a percent sign stays with its number
+        labels = ["\n".join(textwrap.wrap(case.replace(" %", "\N{NO-BREAK SPACE}%"), 26)) for case in cases]
+        left.set_yticks(range(len(cases)), labels)
         left.set_ylim(len(cases) - 0.5, -0.5)
         legend(drawn.figure, left)
     return drawn.content
