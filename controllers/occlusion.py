@@ -16,6 +16,7 @@ R_c is never taken as less than `min_radius`: one sheep hides nothing. The team 
 from __future__ import annotations
 
 import math
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,9 @@ from pydantic import Field
 from shepherd_phys.settings import settings
 from shepherd_phys.state import Floats, WorldState, unit
 
-from .formation import WEDGE, SubFlocks, Team, TeamSettings, bearing_of, heading, wrapped
+from .formation import SubFlocks, Team, TeamSettings
+from .places import WEDGE, bearing_of, heading, wrapped
+from .routes import Routes
 
 
 @settings
@@ -67,6 +70,10 @@ class Occlusion(Team):
         self.settings = settings or TUNED
         super().__init__(self.settings)
 
+    def reset(self, rng: np.random.Generator) -> None:
+        super().reset(rng)
+        self._held: Floats | None = None  # among obstacles: places round the goal, taken when all were home
+
     def _targets(self, state: WorldState, flocks: SubFlocks) -> Floats:
         s = self.settings
         centers, pos = flocks.centers, state.shepherd_pos
@@ -78,10 +85,79 @@ class Occlusion(Team):
             spread = flocks.sheep[f] - centers[f]
             radii[k] = max(math.sqrt((spread * spread).sum(axis=1).max()), s.min_radius)
             extents[k] = (spread @ facing[k]).max()
-        return occlusion_targets(pos, state.goal_pos, own, radii, extents + s.approach, s.circle)
+        goals = self._leads(state, centers)[chosen]
+        targets, pushes = occlusion_targets(pos, goals, own, radii, extents + s.approach, s.circle)
+        if not state.obstacles:
+            return targets
+        self._held = None
+        self._berths = np.column_stack([own, np.where(pushes, 0.0, radii + s.circle)])
+        return np.where(pushes[:, None], targets, self._behind(own, goals, radii))
+
+    def _led(self, state: WorldState) -> WorldState:
+        return state  # each sub-flock has its own way
+
+    def _behind(self, centers: Floats, goals: Floats, radii: Floats) -> Floats:
+        """(P, 2) places behind flocks (P, 2) where these hide goals (P, 2): as far off as no obstacle is between [m]."""
+        s = self.settings
+        away = unit(centers - goals)
+        edge = centers + radii[:, None] * away
+        places = edge + s.circle * away
+        if self._routes is None:
+            return places
+        for off in (s.approach, (s.approach + s.circle) / 2, s.circle):
+            nearer = edge + off * away
+            places = np.where(self._routes[1].are_clear(edge, nearer)[:, None], nearer, places)
+        return places
 
     def _way(self, state: WorldState, targets: Floats, flocks: SubFlocks) -> Floats:
-        return targets  # circling is part of the method
+        if not state.obstacles:
+            return targets  # circling is part of the method
+        ring = self.settings.ring if state.n_shepherds >= 3 else self.settings.ring_out
+        delivered = np.array([*state.goal_pos, ring if state.sheep_in_goal.any() else 0.0])
+        discs = np.stack([self._berths, np.broadcast_to(delivered, self._berths.shape)], axis=1)
+        return self._detour(state.shepherd_pos, targets, discs)
+
+    def _hold(self, state: WorldState, ring: float) -> Floats:
+        if self._routes is None or not state.obstacles:
+            return super()._hold(state, ring)
+        if self._held is None or state.n_shepherds < 3:
+            places = super()._hold(state, ring)
+            self._held = self._routes[1].towards(places, places)
+        self._held = traded(self._routes[1], state.shepherd_pos, self._held)
+        discs = np.broadcast_to([*state.goal_pos, ring], (state.n_shepherds, 1, 3))
+        return self._detour(state.shepherd_pos, self._held, discs)
+
+    def _detour(self, pos: Floats, targets: Floats, discs: Floats) -> Floats:
+        """(P, 2) next places on the shortest ways round obstacles and each one's discs (P, D, 3), of radius 0: none."""
+        places = targets.copy()
+        if self._routes is None:
+            return places
+        for k in range(len(pos)):
+            outside = self._routes[1].outside(discs[k, discs[k, :, 2] > 0])
+            places[k] = outside.towards(pos[k : k + 1], targets[k : k + 1])[0]
+        return places
+
+    def _aside(self, pos: Floats, targets: Floats) -> Floats:
+        aside = super()._aside(pos, targets)
+        if self._routes is None:
+            return aside
+        return np.where(self._routes[1].are_clear(pos, aside)[:, None], aside, targets)
+
+
+def traded(routes: Routes, pos: Floats, places: Floats) -> Floats:
+    """The places (P, 2), two exchanged where that lessens the squares of the ways there, straight ones all [m].
+
+    Where one stands in another's way, each so goes on from there. A trade never makes the sum of the squared ways
+    longer, and walking makes them shorter: nobody trades back and forth.
+    """
+    places = places.copy()
+    for i, j in combinations(range(len(pos)), 2):
+        pair, other = [i, j], [j, i]
+        if ((places[pair] - pos[pair]) ** 2).sum() > ((places[other] - pos[pair]) ** 2).sum():
+            ways = np.concatenate([places[pair], places[other]])
+            if routes.are_clear(pos[[*pair, *pair]], ways).all():
+                places[pair] = places[other]
+    return places
 
 
 def shared_out(pos: Floats, centers: Floats, sizes: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -105,29 +181,27 @@ def shared_out(pos: Floats, centers: Floats, sizes: NDArray[np.int64]) -> NDArra
 
 
 def occlusion_targets(
-    pos: Floats, goal: Floats, centers: Floats, radii: Floats, approach: Floats, circle: float
-) -> Floats:
-    """(P, 2) where each shepherd goes: at its flock, or on round it [m].
+    pos: Floats, goals: Floats, centers: Floats, radii: Floats, approach: Floats, circle: float
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """(P, 2) where each shepherd goes: at its flock, or on round it [m]; and (P,) whether at it: the goal is occluded.
 
     Args:
         pos: (P, 2) shepherds S [m].
-        goal: (2,) g [m].
+        goals: (P, 2) g, to which each one's sub-flock is to go [m].
         centers: (P, 2) centroid c of each one's sub-flock [m].
         radii: (P,) R_c [m].
         approach: (P,) from c, when the goal is occluded [m].
         circle: beyond R_c, when it is not [m].
     """
-    to_flock, to_goal = centers - pos, goal - pos
+    to_flock, to_goal = centers - pos, goals - pos
     distance = np.hypot(*to_flock.T)
     beta = wrapped(bearing_of(to_goal) - bearing_of(to_flock))
     occluded = (np.abs(beta) < np.arctan2(radii, distance)) & (np.hypot(*to_goal.T) > distance)
     bearing = bearing_of(-to_flock)
     on = bearing + np.where(beta < 0, -WEDGE, WEDGE)
-    return np.asarray(
-        centers
-        + np.where(
-            occluded[:, None],
-            approach[:, None] * heading(bearing),
-            (radii + circle)[:, None] * heading(on),
-        )
+    targets = centers + np.where(
+        occluded[:, None],
+        approach[:, None] * heading(bearing),
+        (radii + circle)[:, None] * heading(on),
     )
+    return targets, occluded

@@ -5,7 +5,8 @@ import pytest
 from scenes import NOTHING, arranged
 
 from shepherd_phys.controllers import CONTROLLERS
-from shepherd_phys.controllers.formation import Surroundings, beyond, flocks_out, in_order, leak_places, make_way
+from shepherd_phys.controllers.formation import Surroundings, flocks_out
+from shepherd_phys.controllers.places import beyond, in_order, leak_places, make_way
 from shepherd_phys.controllers.strombom import StrombomTeam
 from shepherd_phys.envs import ShepherdingEnv
 from shepherd_phys.obstacles import Pillar, Wall

@@ -7,15 +7,16 @@ import pytest
 from scenes import arranged, one_flock
 
 from shepherd_phys.controllers import Occlusion
-from shepherd_phys.controllers.formation import WEDGE
+from shepherd_phys.controllers.places import WEDGE
 from shepherd_phys.controllers.occlusion import occlusion_targets, shared_out
 
 
 def targets_of(pos, goal=(0.0, 0.0), center=(20.0, 0.0), radius=2.0):
     pos = np.array([pos], float)
-    return occlusion_targets(
-        pos, np.array(goal), np.array([center]), np.array([radius]), np.array([radius + 4.0]), 8.0
-    )[0]
+    targets, _ = occlusion_targets(
+        pos, np.array([goal]), np.array([center]), np.array([radius]), np.array([radius + 4.0]), 8.0
+    )
+    return targets[0]
 
 
 def test_a_sub_flock_each_from_the_largest_on_and_the_rest_to_the_largest():
