@@ -71,6 +71,7 @@ class Occlusion(Team):
         super().__init__(self.settings)
 
     def reset(self, rng: np.random.Generator) -> None:
+        """Take the episode's generator."""
         super().reset(rng)
         self._held: Floats | None = None  # among obstacles: places round the goal, taken when all were home
 
@@ -97,7 +98,10 @@ class Occlusion(Team):
         return state  # each sub-flock has its own way
 
     def _behind(self, centers: Floats, goals: Floats, radii: Floats) -> Floats:
-        """(P, 2) places behind flocks (P, 2) where these hide goals (P, 2): as far off as no obstacle is between [m]."""
+        """(P, 2) places from which flocks hide their goals, as far off as no obstacle is between [m].
+
+        Behind a wall it would go for its flock round the wall's end, lose the right bearing, and come back for ever.
+        """
         s = self.settings
         away = unit(centers - goals)
         edge = centers + radii[:, None] * away

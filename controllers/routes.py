@@ -79,7 +79,6 @@ class Routes:
             )
         )
 
-
     def are_clear(self, pos: Floats, places: Floats) -> NDArray[np.bool_]:
         """(M,) whether walkers at (M, 2) can go straight to these places (M, 2), and keep clear there [m]."""
         return np.asarray(_are_straight(pos, places, self._hulls, self._clearance))
