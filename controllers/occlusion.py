@@ -26,7 +26,7 @@ from shepherd_phys.settings import settings
 from shepherd_phys.state import Floats, WorldState, unit
 
 from .formation import SubFlocks, Team, TeamSettings
-from .places import WEDGE, bearing_of, heading, wrapped
+from .places import WEDGE, bearing_of, beyond, heading, round_about, wrapped
 from .routes import Routes
 
 
@@ -73,7 +73,9 @@ class Occlusion(Team):
     def reset(self, rng: np.random.Generator) -> None:
         """Take the episode's generator."""
         super().reset(rng)
-        self._held: Floats | None = None  # among obstacles: places round the goal, taken when all were home
+        # among obstacles: places round the goal, taken when all were home; and who is on a detour
+        self._held: Floats | None = None
+        self._detours: NDArray[np.bool_] | None = None
 
     def _targets(self, state: WorldState, flocks: SubFlocks) -> Floats:
         s = self.settings
@@ -88,11 +90,11 @@ class Occlusion(Team):
             extents[k] = (spread @ facing[k]).max()
         goals = self._leads(state, centers)[chosen]
         targets, pushes = occlusion_targets(pos, goals, own, radii, extents + s.approach, s.circle)
-        if not state.obstacles:
-            return targets
-        self._held = None
-        self._berths = np.column_stack([own, np.where(pushes, 0.0, radii + s.circle)])
-        return np.where(pushes[:, None], targets, self._behind(own, goals, radii))
+        if state.obstacles:
+            if self._held is not None:
+                self._held = self._detours = None
+            self._work = pushes, self._behind(own, goals, radii), np.column_stack([own, radii + s.circle])
+        return targets
 
     def _led(self, state: WorldState) -> WorldState:
         return state  # each sub-flock has its own way
@@ -116,29 +118,50 @@ class Occlusion(Team):
     def _way(self, state: WorldState, targets: Floats, flocks: SubFlocks) -> Floats:
         if not state.obstacles:
             return targets  # circling is part of the method
+        pushes, behind, berths = self._work
         ring = self.settings.ring if state.n_shepherds >= 3 else self.settings.ring_out
-        delivered = np.array([*state.goal_pos, ring if state.sheep_in_goal.any() else 0.0])
-        discs = np.stack([self._berths, np.broadcast_to(delivered, self._berths.shape)], axis=1)
-        return self._detour(state.shepherd_pos, targets, discs)
+        delivered = [[*state.goal_pos, ring]] * bool(state.sheep_in_goal.any())
+        discs = [np.array([berth, *delivered]) for berth in berths]
+        return self._detoured(state.shepherd_pos, targets, beyond(behind, state.goal_pos, ring), discs, pushes)
 
     def _hold(self, state: WorldState, ring: float) -> Floats:
+        places = super()._hold(state, ring)
         if self._routes is None or not state.obstacles:
-            return super()._hold(state, ring)
+            return places
+        pos, goal = state.shepherd_pos, state.goal_pos
+        if self._held is None:
+            self._detours = None
         if self._held is None or state.n_shepherds < 3:
-            places = super()._hold(state, ring)
             self._held = self._routes[1].towards(places, places)
-        self._held = traded(self._routes[1], state.shepherd_pos, self._held)
-        discs = np.broadcast_to([*state.goal_pos, ring], (state.n_shepherds, 1, 3))
-        return self._detour(state.shepherd_pos, self._held, discs)
+        self._held = traded(self._routes[1], pos, self._held)
+        on = round_about(pos, self._held, goal, ring)
+        there = (on == self._held).all(axis=1) & self._routes[1].are_clear(pos, on)
+        return self._detoured(pos, on, self._held, [np.array([[*goal, ring]])] * len(pos), there)
 
-    def _detour(self, pos: Floats, targets: Floats, discs: Floats) -> Floats:
-        """(P, 2) next places on the shortest ways round obstacles and each one's discs (P, D, 3), of radius 0: none."""
-        places = targets.copy()
+    def _detoured(
+        self, pos: Floats, places: Floats, ends: Floats, discs: list[Floats], done: NDArray[np.bool_]
+    ) -> Floats:
+        """(P, 2) the next places round discs as given, or on shortest ways to their ends for who is on a detour [m].
+
+        Who walks along the edge of a disc, always to a place a little ahead, and has to turn back for a wall across it,
+        has that place elsewhere when it is round the wall's end, and comes back, for ever. So from there on it goes
+        the shortest way, round obstacles and discs, until it has done what it came for.
+
+        Args:
+            pos: (P, 2) shepherds [m].
+            places: (P, 2) a little ahead [m].
+            ends: (P, 2) where these lead in the end [m].
+            discs: (D, 3) of each shepherd: x, y and radius [m].
+            done: (P,) who needs no detour any more.
+        """
         if self._routes is None:
             return places
-        for k in range(len(pos)):
-            outside = self._routes[1].outside(discs[k, discs[k, :, 2] > 0])
-            places[k] = outside.towards(pos[k : k + 1], targets[k : k + 1])[0]
+        routes = self._routes[1]
+        back = ((routes.towards(pos, places) - pos) * (places - pos)).sum(axis=1) < 0
+        self._detours = (back if self._detours is None else self._detours | back) & ~done
+        places = places.copy()
+        for k in self._detours.nonzero()[0]:
+            places[k] = routes.outside(discs[k]).towards(pos[k : k + 1], ends[k : k + 1])[0]
         return places
 
     def _aside(self, pos: Floats, targets: Floats) -> Floats:
