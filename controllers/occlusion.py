@@ -11,6 +11,10 @@ Our reading of Hu et al. (IEEE TCDS 14(1):126-135, 2022), whose formulas are not
 
 R_c is never taken as less than `min_radius`: one sheep hides nothing. The team has a terminal rule
 (`shepherd_phys.controllers.formation`): sub-flocks that are home are left alone.
+
+Among obstacles g is where its sub-flock has to go first; who circles and would have to turn back for a wall goes the
+shortest way round wall and flock to the other side; nobody steps aside into a wall; and the ring round the goal keeps
+its places until sheep are out again.
 """
 
 from __future__ import annotations
@@ -134,18 +138,17 @@ class Occlusion(Team):
         if self._held is None or state.n_shepherds < 3:
             self._held = self._routes[1].towards(places, places)
         self._held = traded(self._routes[1], pos, self._held)
-        on = round_about(pos, self._held, goal, ring)
+        on = np.asarray(round_about(pos, self._held, goal, ring))
         there = (on == self._held).all(axis=1) & self._routes[1].are_clear(pos, on)
         return self._detoured(pos, on, self._held, [np.array([[*goal, ring]])] * len(pos), there)
 
     def _detoured(
         self, pos: Floats, places: Floats, ends: Floats, discs: list[Floats], done: NDArray[np.bool_]
     ) -> Floats:
-        """(P, 2) the next places round discs as given, or on shortest ways to their ends for who is on a detour [m].
+        """(P, 2) the next places as given, or, for who is on a detour, those on the shortest ways to the ends [m].
 
-        Who walks along the edge of a disc, always to a place a little ahead, and has to turn back for a wall across it,
-        has that place elsewhere when it is round the wall's end, and comes back, for ever. So from there on it goes
-        the shortest way, round obstacles and discs, until it has done what it came for.
+        Who walks along a disc's edge aims a little ahead. If a wall across the edge makes it turn back, the place
+        ahead turns back with it, and so it would go back and forth for ever. A detour has an end that stays.
 
         Args:
             pos: (P, 2) shepherds [m].
@@ -172,7 +175,7 @@ class Occlusion(Team):
 
 
 def traded(routes: Routes, pos: Floats, places: Floats) -> Floats:
-    """The places (P, 2), two exchanged where that lessens the squares of the ways there, straight ones all [m].
+    """The places (P, 2) of shepherds, two exchanged where that lessens the squares of their ways, all straight [m].
 
     Where one stands in another's way, each so goes on from there. A trade never makes the sum of the squared ways
     longer, and walking makes them shorter: nobody trades back and forth.

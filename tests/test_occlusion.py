@@ -92,7 +92,7 @@ def test_behind_a_flock_means_on_its_side_of_a_wall():
     for x, behind in ((40.0, 29.0), (28.0, 27.0), (23.0, 29.0)):  # none; it stands nearer; too near to stand before it
         state = arranged(sheep, [[20.0, 20.0]]).but(obstacles=(Wall((x, -30.0), (x, 30.0)),))
         team.act(NOTHING, state)
-        assert team._targets(state, one_flock(sheep))[0] == pytest.approx([behind, 0.0])
+        assert team._behind(np.array([[20.0, 0.0]]), np.zeros((1, 2)), np.ones(1))[0] == pytest.approx([behind, 0.0])
 
 
 def test_nobody_steps_aside_into_a_wall():

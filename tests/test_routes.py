@@ -83,9 +83,7 @@ def test_where_there_is_no_way_the_target_stays():
 def test_straight_ways_to_places_that_are_clear():
     plan = routes(Pillar((0.0, 0.0), 1.0))
     pos = np.array([[-5.0, 0.0]] * 4)
-    places = np.array(
-        [[5.0, 0.0], [-2.0, 0.0], [-1.2, 0.0], [5.0, 4.0]]
-    )  # behind, before, too near, past it
+    places = np.array([[5.0, 0.0], [-2.0, 0.0], [-1.2, 0.0], [5.0, 4.0]])  # behind, before, too near, past it
     assert plan.are_clear(pos, places).tolist() == [False, True, False, True]
 
 
