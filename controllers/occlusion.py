@@ -13,8 +13,7 @@ R_c is never taken as less than `min_radius`: one sheep hides nothing. The team 
 (`shepherd_phys.controllers.formation`): sub-flocks that are home are left alone.
 
 Among obstacles g is where its sub-flock has to go first; who circles and would have to turn back for a wall goes the
-shortest way round wall and flock to the other side; nobody steps aside into a wall; and the ring round the goal keeps
-its places until sheep are out again.
+shortest way round wall and flock to the other side, or to its place round the goal; nobody steps aside into a wall.
 """
 
 from __future__ import annotations
@@ -63,6 +62,12 @@ TUNED = OcclusionSettings(
 version 0.1.0; the record is docs/tuning/occlusion.toml."""
 
 
+PATIENCE = 25
+"""A shepherd that was led back in more steps than this takes a detour."""
+NEAR = 0.5
+"""Nobody trades places round the goal once all are as near to their own [m]."""
+
+
 class Occlusion(Team):
     """The team: a sub-flock for each shepherd, a terminal rule.
 
@@ -77,9 +82,11 @@ class Occlusion(Team):
     def reset(self, rng: np.random.Generator) -> None:
         """Take the episode's generator."""
         super().reset(rng)
-        # among obstacles: places round the goal, taken when all were home; and who is on a detour
+        # among obstacles: whether all were home; for how many steps each was led back since then, or since they were
+        # out; and, when that was too many, the places round the goal that are kept till all are there
+        self._home = False
+        self._led_back: Floats | None = None
         self._held: Floats | None = None
-        self._detours: NDArray[np.bool_] | None = None
 
     def _targets(self, state: WorldState, flocks: SubFlocks) -> Floats:
         s = self.settings
@@ -95,8 +102,8 @@ class Occlusion(Team):
         goals = self._leads(state, centers)[chosen]
         targets, pushes = occlusion_targets(pos, goals, own, radii, extents + s.approach, s.circle)
         if state.obstacles:
-            if self._held is not None:
-                self._held = self._detours = None
+            if self._home:
+                self._home, self._led_back = False, None
             self._work = pushes, self._behind(own, goals, radii), np.column_stack([own, radii + s.circle])
         return targets
 
@@ -133,14 +140,17 @@ class Occlusion(Team):
         if self._routes is None or not state.obstacles:
             return places
         pos, goal = state.shepherd_pos, state.goal_pos
-        if self._held is None:
-            self._detours = None
-        if self._held is None or state.n_shepherds < 3:
-            self._held = self._routes[1].towards(places, places)
-        self._held = traded(self._routes[1], pos, self._held)
-        on = np.asarray(round_about(pos, self._held, goal, ring))
-        there = (on == self._held).all(axis=1) & self._routes[1].are_clear(pos, on)
-        return self._detoured(pos, on, self._held, [np.array([[*goal, ring]])] * len(pos), there)
+        if not self._home:
+            self._home, self._led_back = True, None
+        disc = np.array([[*goal, ring]])
+        if self._led_back is None or not (self._led_back > PATIENCE).any():
+            self._held = None
+        else:
+            kept = self._routes[1].towards(places, places) if self._held is None else self._held
+            self._held = places = traded(self._routes[1].outside(disc), pos, kept)
+        on = np.asarray(round_about(pos, places, goal, ring))
+        there = (on == places).all(axis=1) & self._routes[1].are_clear(pos, on)
+        return self._detoured(pos, on, places, [disc] * len(pos), there)
 
     def _detoured(
         self, pos: Floats, places: Floats, ends: Floats, discs: list[Floats], done: NDArray[np.bool_]
@@ -161,9 +171,10 @@ class Occlusion(Team):
             return places
         routes = self._routes[1]
         back = ((routes.towards(pos, places) - pos) * (places - pos)).sum(axis=1) < 0
-        self._detours = (back if self._detours is None else self._detours | back) & ~done
+        before = np.zeros(len(pos)) if self._led_back is None else self._led_back
+        self._led_back = np.where(done, 0.0, before + back)
         places = places.copy()
-        for k in self._detours.nonzero()[0]:
+        for k in (self._led_back > PATIENCE).nonzero()[0]:
             places[k] = routes.outside(discs[k]).towards(pos[k : k + 1], ends[k : k + 1])[0]
         return places
 
@@ -175,19 +186,21 @@ class Occlusion(Team):
 
 
 def traded(routes: Routes, pos: Floats, places: Floats) -> Floats:
-    """The places (P, 2) of shepherds, two exchanged where that lessens the squares of their ways, all straight [m].
+    """The places (P, 2) of shepherds, two exchanged where that lessens the sum of the squares of their ways [m].
 
-    Where one stands in another's way, each so goes on from there. A trade never makes the sum of the squared ways
-    longer, and walking makes them shorter: nobody trades back and forth.
+    Where one stands in another's way, each so goes on from there. Walking too makes ways shorter, and so nobody trades
+    back and forth.
     """
-    places = places.copy()
-    for i, j in combinations(range(len(pos)), 2):
-        pair, other = [i, j], [j, i]
-        if ((places[pair] - pos[pair]) ** 2).sum() > ((places[other] - pos[pair]) ** 2).sum():
-            ways = np.concatenate([places[pair], places[other]])
-            if routes.are_clear(pos[[*pair, *pair]], ways).all():
-                places[pair] = places[other]
-    return places
+    p = len(pos)
+    if p < 2 or np.hypot(*(places - pos).T).max() < NEAR:
+        return places
+    ways = routes.lengths(np.repeat(pos, p, axis=0), np.tile(places, (p, 1))).reshape(p, p)
+    place = np.arange(p)
+    for i, j in combinations(range(p), 2):
+        kept = ways[i, place[i]] ** 2 + ways[j, place[j]] ** 2
+        if ways[i, place[j]] ** 2 + ways[j, place[i]] ** 2 < kept:
+            place[[i, j]] = place[[j, i]]
+    return np.asarray(places[place])
 
 
 def shared_out(pos: Floats, centers: Floats, sizes: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -79,6 +79,17 @@ class Routes:
             )
         )
 
+    def lengths(self, pos: Floats, targets: Floats) -> Floats:
+        """(M,) lengths of the ways from (M, 2) to (M, 2) [m], as `towards` leads."""
+        here, walked = pos, np.zeros(len(pos))
+        for _ in range(len(self._nodes) + 2):  # turns, the target and, where it was moved, that
+            ahead = self.towards(here, targets)
+            steps = np.hypot(*(ahead - here).T)
+            if not steps.any():
+                break
+            here, walked = ahead, walked + steps
+        return walked
+
     def are_clear(self, pos: Floats, places: Floats) -> NDArray[np.bool_]:
         """(M,) whether walkers at (M, 2) can go straight to these places (M, 2), and keep clear there [m]."""
         return np.asarray(_are_straight(pos, places, self._hulls, self._clearance))

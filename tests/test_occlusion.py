@@ -107,10 +107,12 @@ def test_nobody_steps_aside_into_a_wall():
     assert aside[1] == pytest.approx([0.6 - math.cos(1.2), math.sin(1.2)])
 
 
-def test_places_round_the_goal_are_traded_where_that_shortens_the_longer_way():
+def test_places_round_the_goal_are_traded_where_one_stands_in_the_others_way():
     pos, places = np.array([[0.0, 0.0], [1.0, 0.1]]), np.array([[8.0, 0.0], [1.0, 0.0]])
     free = Routes(Surroundings().of((Pillar((0.0, 20.0), 1.0),)), 0.5)
     assert traded(free, pos, places).tolist() == [[1.0, 0.0], [8.0, 0.0]]
     assert traded(free, pos, places[::-1]).tolist() == [[1.0, 0.0], [8.0, 0.0]]
-    walled = Routes(Surroundings().of((Wall((4.0, -9.0), (4.0, 9.0)),)), 0.5)
-    assert traded(walled, pos, places).tolist() == places.tolist()
+    # a wall between them, which reaches further down: the upper one is the nearer to both, but not on foot
+    walled = Routes(Surroundings().of((Wall((0.5, -9.0), (0.5, 3.0)),)), 0.5)
+    pos, places = np.array([[-1.0, 0.0], [2.0, -8.0]]), np.array([[2.0, 0.0], [-1.0, -8.0]])
+    assert traded(walled, pos, places).tolist() == [[-1.0, -8.0], [2.0, 0.0]]
