@@ -78,7 +78,7 @@ def walks(state, steps=400, slow=0.3):
 def test_a_wall_across_its_circle_does_not_send_it_back_and_forth():
     """The circle of 10 m round the flock cuts the wall; the shepherd ends where the flock hides the goal."""
     sheep = [[20 + x, y] for x in (-1, 0, 1) for y in (-1, 0, 1)]
-    for wall in (Wall((14.0, 4.0), (24.0, 14.0)), Wall((20.0, 5.0), (20.0, 22.0)), Wall((20.0, -5.0), (20.0, -22.0))):
+    for wall in (Wall((14.0, 4.0), (24.0, 14.0)), Wall((4.0, 7.0), (36.0, 7.0)), Wall((16.0, 8.0), (36.0, 8.0))):
         state = arranged(sheep, [[8.0, 12.0]]).but(obstacles=(wall,))
         way = walks(state)[:, 0]
         assert way[-1, 0] > 24 and abs(way[-1, 1]) < 3
@@ -112,7 +112,7 @@ def test_places_round_the_goal_are_traded_where_one_stands_in_the_others_way():
     free = Routes(Surroundings().of((Pillar((0.0, 20.0), 1.0),)), 0.5)
     assert traded(free, pos, places).tolist() == [[1.0, 0.0], [8.0, 0.0]]
     assert traded(free, pos, places[::-1]).tolist() == [[1.0, 0.0], [8.0, 0.0]]
-    # a wall between them, which reaches further down: the upper one is the nearer to both, but not on foot
-    walled = Routes(Surroundings().of((Wall((0.5, -9.0), (0.5, 3.0)),)), 0.5)
-    pos, places = np.array([[-1.0, 0.0], [2.0, -8.0]]), np.array([[2.0, 0.0], [-1.0, -8.0]])
-    assert traded(walled, pos, places).tolist() == [[-1.0, -8.0], [2.0, 0.0]]
+    # as the crow flies each would be nearer to the other's, across a long wall
+    walled = Routes(Surroundings().of((Wall((0.5, -30.0), (0.5, 30.0)),)), 0.5)
+    pos, places = np.array([[-1.0, 0.0], [2.0, -8.0]]), np.array([[-1.0, -8.0], [2.0, 0.0]])
+    assert traded(walled, pos, places).tolist() == places.tolist()

@@ -80,6 +80,12 @@ def test_where_there_is_no_way_the_target_stays():
     assert routes(*cage).towards(np.array([[5.0, 0.0]]), np.array([[0.0, 0.0]])).tolist() == [[0.0, 0.0]]
 
 
+def test_lengths_are_those_of_the_ways_walked():
+    plan, ends = routes(Wall((-5.0, 0.0), (2.0, 0.0), 0.2)), ([0.0, -3.0], [0.0, 3.0])
+    starts, targets = np.array([ends[0], ends[0], ends[0]]), np.array([ends[1], ends[0], [4.0, 0.0]])
+    assert plan.lengths(starts, targets) == pytest.approx([length(way(plan, *ends)), 0.0, 5.0])
+
+
 def test_straight_ways_to_places_that_are_clear():
     plan = routes(Pillar((0.0, 0.0), 1.0))
     pos = np.array([[-5.0, 0.0]] * 4)
