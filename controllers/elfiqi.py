@@ -34,7 +34,8 @@ from pydantic import Field
 from shepherd_phys.settings import Settings, settings
 from shepherd_phys.state import Floats, WorldState, centroid, unit
 
-from .formation import SubFlocks, Surroundings, Team, TeamSettings, bearing_of, heading, in_order, limited, wrapped
+from .formation import SubFlocks, Surroundings, Team, TeamSettings
+from .places import bearing_of, heading, in_order, limited, wrapped
 
 MU = 2.0
 """mu, how fast repulsion fades."""

@@ -32,7 +32,8 @@ from pydantic import Field
 from shepherd_phys.settings import Settings, settings
 from shepherd_phys.state import Floats, WorldState, centroid
 
-from .formation import SubFlocks, Team, TeamSettings, bearing_of, heading, in_order, limited
+from .formation import SubFlocks, Team, TeamSettings
+from .places import bearing_of, heading, in_order, limited
 
 HALVINGS = 50
 """Steps of the search for the arc's width."""

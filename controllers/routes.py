@@ -13,6 +13,7 @@ again: the last way is the shortest round all, since heeding fewer hulls never m
 from __future__ import annotations
 
 import math
+from copy import copy
 from typing import NamedTuple
 
 import numpy as np
@@ -78,6 +79,43 @@ class Routes:
             )
         )
 
+    def lengths(self, pos: Floats, targets: Floats) -> Floats:
+        """(M,) lengths of the ways from (M, 2) to (M, 2) [m], as `towards` leads."""
+        here, walked = pos, np.zeros(len(pos))
+        for _ in range(len(self._nodes) + 2):  # turns, the target and, where it was moved, that
+            ahead = self.towards(here, targets)
+            steps = np.hypot(*(ahead - here).T)
+            if not steps.any():
+                break
+            here, walked = ahead, walked + steps
+        return walked
+
+    def are_clear(self, pos: Floats, places: Floats) -> NDArray[np.bool_]:
+        """(M,) whether walkers at (M, 2) can go straight to these places (M, 2), and keep clear there [m]."""
+        return np.asarray(_are_straight(pos, places, self._hulls, self._clearance))
+
+    def outside(self, discs: Floats) -> Routes:
+        """The same obstacles and discs that the walkers' centres keep out of, or leave if they are in.
+
+        Args:
+            discs: (D, 3) x, y and radius, not less than the clearance [m].
+        """
+        own, inner, clearance = self._hulls, discs[:, 2] - self._clearance, self._clearance
+        discs = np.column_stack([discs[:, :2], inner])
+        added = Hulls(first=np.arange(len(discs) + 1), corners=discs[:, :2], radius=inner, discs=discs)
+        nodes, owners = _nodes(added, clearance)
+        kept, clear = _are_clear(self._nodes, added, clearance), _are_clear(nodes, own, clearance)
+        routes = copy(self)
+        routes._hulls = Hulls(
+            first=np.concatenate([own.first, own.first[-1] + added.first[1:]]),
+            corners=np.concatenate([own.corners, added.corners]),
+            radius=np.concatenate([own.radius, added.radius]),
+            discs=np.concatenate([own.discs, added.discs]),
+        )
+        routes._nodes = np.concatenate([self._nodes[kept], nodes[clear]])
+        routes._owners = np.concatenate([self._owners[kept], len(own.radius) + owners[clear]])
+        return routes
+
 
 def _hulls(geometry: Geometry) -> Hulls:
     shapes = geometry.shapes
@@ -118,8 +156,19 @@ def _are_clear(places, hulls, clearance):  # type: ignore[no-untyped-def]
     clear = np.ones(len(places), np.bool_)
     for i in range(len(places)):
         for hull in range(len(hulls.radius)):
-            clear[i] &= _gap(hulls, hull, places[i], places[i]) >= clearance
+            disc = hulls.discs[hull]
+            if math.hypot(places[i, 0] - disc[0], places[i, 1] - disc[1]) < disc[2] + clearance:
+                clear[i] &= _gap(hulls, hull, places[i], places[i]) >= clearance
     return clear
+
+
+@njit(cache=True)
+def _are_straight(pos, places, hulls, clearance):  # type: ignore[no-untyped-def]
+    straight = _are_clear(places, hulls, clearance)
+    for k in range(len(pos)):
+        for hull in range(len(hulls.radius)):
+            straight[k] &= not _blocks(hulls, hull, clearance, pos[k], places[k])
+    return straight
 
 
 @njit(cache=True)

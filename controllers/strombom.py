@@ -28,7 +28,8 @@ from pydantic import Field
 from shepherd_phys.settings import settings
 from shepherd_phys.state import Floats, WorldState
 
-from .formation import SubFlocks, Team, TeamSettings, walk
+from .formation import SubFlocks, Team, TeamSettings
+from .places import walk
 
 
 @settings

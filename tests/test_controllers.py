@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scenes import NOTHING, arranged
 
 from shepherd_phys.controllers import CONTROLLERS, POLICIES, Random, StrombomLiteral, StrombomTeam
-from shepherd_phys.controllers.formation import ring_places, round_about, walk
+from shepherd_phys.controllers.places import ring_places, round_about, walk
 from shepherd_phys.controllers.strombom import StrombomSettings, team_targets
 from shepherd_phys.envs import ShepherdingEnv
 from shepherd_phys.scenario import Scenario

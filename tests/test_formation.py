@@ -5,7 +5,8 @@ import pytest
 from scenes import NOTHING, arranged
 
 from shepherd_phys.controllers import CONTROLLERS
-from shepherd_phys.controllers.formation import Surroundings, beyond, flocks_out, in_order, leak_places, make_way
+from shepherd_phys.controllers.formation import Surroundings, flocks_out
+from shepherd_phys.controllers.places import beyond, in_order, leak_places, make_way
 from shepherd_phys.controllers.strombom import StrombomTeam
 from shepherd_phys.envs import ShepherdingEnv
 from shepherd_phys.obstacles import Pillar, Wall
@@ -113,7 +114,5 @@ def test_every_tuned_team_walks_and_leads_its_flock_round_walls(name):
     for _ in range(700):
         state = world.step(controller.act(NOTHING, state))
         nearest = min(nearest, surfaces.static_distances(state.shepherd_pos)[0].min())
-    assert state.sheep_arrived.mean() >= 0.95
-    assert state.sheep_in_goal.mean() >= 0.8  # walls stand where the team would ring the goal, so some leak
-    # the radius of a shepherd: none touched a wall; but one of `occlusion` is pressed against it for some seconds
-    assert nearest > (0.1 if name == "occlusion" else 0.25)
+    assert state.sheep_in_goal.mean() >= 0.95
+    assert nearest > 0.25  # the radius of a shepherd: none touched a wall

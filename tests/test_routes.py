@@ -80,6 +80,29 @@ def test_where_there_is_no_way_the_target_stays():
     assert routes(*cage).towards(np.array([[5.0, 0.0]]), np.array([[0.0, 0.0]])).tolist() == [[0.0, 0.0]]
 
 
+def test_lengths_are_those_of_the_ways_walked():
+    plan, ends = routes(Wall((-5.0, 0.0), (2.0, 0.0), 0.2)), ([0.0, -3.0], [0.0, 3.0])
+    starts, targets = np.array([ends[0], ends[0], ends[0]]), np.array([ends[1], ends[0], [4.0, 0.0]])
+    assert plan.lengths(starts, targets) == pytest.approx([length(way(plan, *ends)), 0.0, 5.0])
+
+
+def test_straight_ways_to_places_that_are_clear():
+    plan = routes(Pillar((0.0, 0.0), 1.0))
+    pos = np.array([[-5.0, 0.0]] * 4)
+    places = np.array([[5.0, 0.0], [-2.0, 0.0], [-1.2, 0.0], [5.0, 4.0]])  # behind, before, too near, past it
+    assert plan.are_clear(pos, places).tolist() == [False, True, False, True]
+
+
+def test_ways_outside_a_disc_are_those_round_a_pillar_in_its_place():
+    """The walker's centre keeps out of the disc: clearance and all."""
+    wall = Wall((0.0, 2.0), (0.0, 9.0))
+    plan, ends = routes(wall).outside(np.array([[0.0, 0.0, 3.0]])), ([-8.0, 0.5], [8.0, 0.5])
+    assert way(plan, *ends) == pytest.approx(way(routes(wall, Pillar((0.0, 0.0), 2.5)), *ends))
+    assert way(plan, [1.0, 0.0], [8.0, 0.0]).tolist() == [[1.0, 0.0], [8.0, 0.0]]  # out of it
+    assert plan.are_clear(np.array([[-8.0, 0.0]]), np.array([[-2.0, 0.0]])).tolist() == [False]
+    assert routes(wall).outside(np.empty((0, 3))).towards(*np.array([[[-8.0, 5.0]], [[8.0, 5.0]]])).shape == (1, 2)
+
+
 class Crescent:
     """An obstacle of a user's own, with a shape that is not pymunk's own."""
 
