@@ -12,7 +12,7 @@ import pymunk
 
 from shepherd_phys.bodies import SHEEP, Body, Disc, built
 from shepherd_phys.geometry import surfaces
-from shepherd_phys.obstacles import MIN_THICKNESS, Box, Fence, Obstacle, Pillar, Polygon, Wall
+from shepherd_phys.obstacles import MIN_THICKNESS, Box, Fence, Obstacle, Pillar, Polygon, Wall, outline
 from shepherd_phys.scenario import Scenario
 from shepherd_phys.state import Floats, WorldState
 from shepherd_phys.world import World
@@ -56,7 +56,9 @@ class _Charge:
 def impacts(count: int, seed: int, shepherd: Body | None = None, sheep: Body = SHEEP, **engine: int) -> dict[str, Any]:
     """Run ``count`` impacts at top speed and random angles, spread evenly over kinds, in worlds of many lanes.
 
-    A body has tunnelled if at the end of any control step its centre lies inside the obstacle or on its far side.
+    A body has tunnelled if at the end of any control step its centre lies inside the obstacle or on its far side, or if
+    its straight way in that step leads through the obstacle and the way round is longer than the fastest body can walk
+    in a step: whoever slides round a corner cuts it off.
 
     Args:
         count: number of impacts, rounded up to whole worlds.
@@ -95,6 +97,7 @@ def impacts(count: int, seed: int, shepherd: Body | None = None, sheep: Body = S
     front_of = np.array([int(np.flatnonzero(is_front & (lane_of == lane))[0]) for lane in lane_of])
     across = np.isin([kind for _, kind in lanes], ACROSS)[lane_of]
     gap_to = _Gap(scenario.obstacles, lane_of)
+    stride = float(speed.max()) * scenario.control_dt
 
     done = touched = 0
     pushed = rested = 0.0
@@ -133,7 +136,7 @@ def impacts(count: int, seed: int, shepherd: Body | None = None, sheep: Body = S
             gap = gap_to(now)
             hit |= gap < radius + 1e-2
             beyond = across & (np.sign(now[:, 0]) != side) & (np.abs(now[:, 1] - LANE * lane_of) < HALF_WALL)
-            through |= (gap < 0.0) | beyond | gap_to.crossed(pos, now, gap < 1.0)
+            through |= (gap < 0.0) | beyond | gap_to.crossed(pos, now, gap < 1.0, stride)
             pushed = max(pushed, _overlap(world.space)) if step < STEPS else pushed
             pos = now
         rested = max(rested, _overlap(world.space))
@@ -171,13 +174,30 @@ class _Gap:
         """From centres (M, 2) to the surface (M,) [m]."""
         return np.asarray(np.where(self._own, self._geometry.static_distances(pos)[0], math.inf).min(axis=1))
 
-    def crossed(self, before: Floats, now: Floats, which: Any) -> Any:
-        """Of those asked about, whether the straight way from before to now leads through it (M,)."""
+    def crossed(self, before: Floats, now: Floats, which: Any, stride: float) -> Any:
+        """Of those asked about, who went through: the straight way leads through, the way round is over ``stride``."""
         crossed = np.zeros(len(now), dtype=bool)
         for i in which.nonzero()[0]:
             start, end = tuple(before[i].tolist()), tuple(now[i].tolist())
-            crossed[i] = any(shape.segment_query(start, end) is not None for shape in self._shapes[i])
+            crossed[i] = any(
+                shape.segment_query(start, end) is not None and _way_round(shape, before[i], now[i]) > stride
+                for shape in self._shapes[i]
+            )
         return crossed
+
+
+def _way_round(shape: pymunk.Shape, start: Floats, end: Floats) -> float:
+    """The shortest way from start to end (2,) round a convex shape that lies between them [m]."""
+    drawn = outline(shape)
+    assert drawn is not None  # the kinds above are all of discs, segments and polygons
+    turns = np.linspace(0.0, 2 * np.pi, 32, endpoint=False)
+    ring = drawn.radius * np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    points = np.concatenate([(drawn.points[:, None] + ring).reshape(-1, 2), start[None], end[None]])
+    hull = np.array(pymunk.Poly(None, points.tolist()).get_vertices())  # which takes the convex hull, in order
+    first, last = sorted(int(np.hypot(*(hull - place).T).argmin()) for place in (start, end))
+    sides = np.hypot(*(np.roll(hull, -1, axis=0) - hull).T)
+    one = float(sides[first:last].sum())
+    return min(one, float(sides.sum()) - one)
 
 
 def _overlap(space: pymunk.Space) -> float:
