@@ -48,7 +48,7 @@ def cpu_count() -> int:
 
 
 def flag(metavar: str, default: str | None = None, text: str | None = None) -> Any:
-    """How ``--help`` shows a flag: ``default`` in words where the value does not tell, ``text`` where no docstring can."""
+    """How ``--help`` shows a flag; ``default`` in words where the value does not tell, ``text`` for its docstring."""
     hint = f"(default: {default})" if default else default
     return tyro.conf.arg(metavar=metavar, help_behavior_hint=hint, help=text)
 
@@ -88,9 +88,10 @@ def parsed(cls: type[T], prog: str, argv: Sequence[str]) -> tuple[T, set[str]]:
 def _hint(problem: str, names: Sequence[str]) -> str:
     """What helps with an error of the command line: the flag that was meant, or what a flag takes."""
     if problem.startswith(UNKNOWN):
-        flags = [f"--{name.replace('_', '-')}" for name in names]
-        words = [word for word in problem.removeprefix(UNKNOWN).strip().split(", ") if word.startswith("--")]
-        return "".join([meant(word.split("=")[0], flags) for word in words][:1])
+        flags = [name.replace("_", "-") for name in names]
+        words = [word for word in problem.removeprefix(UNKNOWN).split() if word.startswith("--")]
+        hints = [meant(re.split("[=,]", word[2:])[0].replace("_", "-"), flags, before="--") for word in words]
+        return "".join(hints[:1])
     wanted = [f"; --{name} takes {what}" for name, what in WANTED.items() if f"--{name}" in problem]
     return "".join(wanted[:1])
 

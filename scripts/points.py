@@ -49,7 +49,7 @@ SEEN = (
     "control_dt",
     "imperfections",
 )
-"""Fields of a scenario that change what a policy meets. Numbers of flocks, neighbours and shepherds are varied freely."""
+"""Fields of a scenario that change what a policy meets. How many flocks, neighbours and shepherds is varied freely."""
 KINDS: dict[str, type] = {
     **dict.fromkeys(COLUMNS, float),
     **dict.fromkeys(("controller", "scenario", "settings_hash", "version"), str),

@@ -95,10 +95,16 @@ def _no_such_field(cls: type[Any], unknown: Mapping[str, Any]) -> str:
     return f"{shown}: there is no such field (given: {_brief(value)}){guess or ';'} {there}"
 
 
-def meant(word: str, known: Iterable[str]) -> str:
-    """``; did you mean NAME?``, the known name that a misspelled one is nearest to; nothing where none is near."""
-    near = difflib.get_close_matches(word, list(known), n=1)
-    return f"; did you mean {near[0]}?" if near else ""
+def meant(word: str, known: Iterable[str], before: str = "") -> str:
+    """``; did you mean NAME?``, the known name that a misspelled one is nearest to; nothing where none is near.
+
+    Args:
+        word: the misspelled name.
+        known: the names that there are.
+        before: stands before the name that is told.
+    """
+    near = difflib.get_close_matches(word, list(known), n=1, cutoff=0.7)
+    return f"; did you mean {before}{near[0]}?" if near else ""
 
 
 def _brief(value: object) -> str:
