@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shepherd_phys.scenario import SUCCESS_FRACTION
+from shepherd_phys.settings import kind_of
 from shepherd_phys.state import WorldState
 from shepherd_phys.workers import explain
 
@@ -191,8 +192,13 @@ def _in_goal(state: WorldState) -> float:
 
 
 def checked_action(action: Any, controller: Controller, state: WorldState) -> NDArray[np.float64]:
-    """The action as (P, 2) finite numbers."""
-    where = f"controller {name_of(controller)}, step {state.step}"
+    """The action as (P, 2) finite numbers.
+
+    Raises:
+        ControllerError: it is not; a class of a user's own is named as ``module:Name``.
+    """
+    kind = kind_of(controller)
+    where = f"controller {kind if ':' in kind else name_of(controller)}, step {state.step}"
     try:
         numbers = np.asarray(action, dtype=np.float64)
     except (TypeError, ValueError):

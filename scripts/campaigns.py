@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from shepherd_phys import __version__, campaign
+from shepherd_phys import __version__, campaign, neighbours
 from shepherd_phys.campaign import CampaignError, Failure, Hire, Ledger, Outcome, Task
 from shepherd_phys.controllers.evaluation import ControllerError
 from shepherd_phys.envs.shepherding import ShepherdingEnv
@@ -92,6 +92,8 @@ def _rehearse(todo: Sequence[Task]) -> None:
     """
     if not todo:
         return
+    if not _are_compiled():
+        print("compiling the kernels, once; about a minute", file=sys.stderr, flush=True)
     env = ShepherdingEnv(SCENARIOS["small"], rewards={}, lidar=None)
     env.reset(seed=0)
     env.step(np.zeros((env.scenario.n_shepherds, 2)))  # compiled code is kept on disk: workers find it there
@@ -100,6 +102,12 @@ def _rehearse(todo: Sequence[Task]) -> None:
         seeds.setdefault(task.settings_hash, []).append(task.seed)
     for task in {task.settings_hash: task for task in todo}.values():
         place(task.spec, seeds[task.settings_hash][:3])
+
+
+def _are_compiled() -> bool:
+    """Whether numba has kept compiled code where it keeps ours; also where it is told to compile nothing."""
+    stats = getattr(neighbours.surroundings, "stats", None)
+    return stats is None or any(Path(stats.cache_path).glob("neighbours.*.nbi"))
 
 
 def lost(failures: Iterable[Failure]) -> list[str]:

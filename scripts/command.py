@@ -19,7 +19,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from shepherd_phys import campaign
 from shepherd_phys.cluster import Cluster
-from shepherd_phys.settings import SettingsError
+from shepherd_phys.settings import SettingsError, meant
 
 LOG_SECONDS = 30.0
 """Progress is a line so often where standard error is no terminal [s]."""
@@ -34,6 +34,8 @@ WANTED = {
 }
 """What a flag takes, for the error that says so."""
 
+UNKNOWN = "Unrecognized options:"
+"""How an error of tyro about words that are no options begins."""
 ADDRESS = re.compile(r"([a-z]+://)?[^\s/]+:\d+")
 """Of a scheduler."""
 
@@ -45,10 +47,10 @@ def cpu_count() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def flag(metavar: str, default: str | None = None) -> Any:
-    """How ``--help`` shows a flag; ``default`` in words where the value does not tell."""
+def flag(metavar: str, default: str | None = None, text: str | None = None) -> Any:
+    """How ``--help`` shows a flag; ``default`` in words where the value does not tell, ``text`` for its docstring."""
     hint = f"(default: {default})" if default else default
-    return tyro.conf.arg(metavar=metavar, help_behavior_hint=hint)
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint=hint, help=text)
 
 
 def parsed(cls: type[T], prog: str, argv: Sequence[str]) -> tuple[T, set[str]]:
@@ -64,6 +66,7 @@ def parsed(cls: type[T], prog: str, argv: Sequence[str]) -> tuple[T, set[str]]:
         SystemExit: after ``--help``.
     """
     said = io.StringIO()
+    names = [f.name for f in fields(cls)]  # type: ignore[arg-type]
     try:
         with contextlib.redirect_stderr(said):
             options = tyro.cli(cls, prog=prog, args=list(argv))
@@ -71,9 +74,7 @@ def parsed(cls: type[T], prog: str, argv: Sequence[str]) -> tuple[T, set[str]]:
         if not end.code:
             raise
         problem = _one_line(said.getvalue())
-        wanted = [f"; --{name} takes {what}" for name, what in WANTED.items() if f"--{name}" in problem]
-        raise SettingsError(f"{problem}{''.join(wanted[:1])} (see {prog} --help)") from None
-    names = [f.name for f in fields(cls)]  # type: ignore[arg-type]
+        raise SettingsError(f"{problem}{_hint(problem, names)} (see {prog} --help)") from None
     words = {word.split("=")[0].replace("_", "-") for word in argv}
     given = {name for name in names if f"--{name.replace('_', '-')}" in words}
     scheduler = getattr(options, "scheduler", None)
@@ -82,6 +83,17 @@ def parsed(cls: type[T], prog: str, argv: Sequence[str]) -> tuple[T, set[str]]:
     if {"workers", "scheduler"} <= given:
         raise SettingsError("--workers and --scheduler: the workers are the cluster's then; leave one of the two out")
     return options, given
+
+
+def _hint(problem: str, names: Sequence[str]) -> str:
+    """What helps with an error of the command line: the flag that was meant, or what a flag takes."""
+    if problem.startswith(UNKNOWN):
+        flags = [name.replace("_", "-") for name in names]
+        words = [word for word in problem.removeprefix(UNKNOWN).split() if word.startswith("--")]
+        hints = [meant(re.split("[=,]", word[2:])[0].replace("_", "-"), flags, before="--") for word in words]
+        return "".join(hints[:1])
+    wanted = [f"; --{name} takes {what}" for name, what in WANTED.items() if f"--{name}" in problem]
+    return "".join(wanted[:1])
 
 
 def at_least(values: Mapping[str, Any], least: Mapping[str, int]) -> None:
@@ -134,7 +146,7 @@ def progress_bar() -> Iterator[Any]:
         before = ended if before is None else before
         if first is None and ended > before:
             first = time.monotonic(), ended  # the pace is counted from here: until here workers were starting
-        pace = "starting"
+        pace = f"continuing, {before} of {now.total} there" if before else "starting"
         if first is not None and ended > first[1]:
             rate = (ended - first[1]) / (time.monotonic() - first[0])
             pace = f"{rate:.2f} episodes/s, {clock((now.total - ended) / rate)} left"

@@ -23,7 +23,7 @@ from shepherd_phys.settings import SettingsError, read_toml
 from .campaigns import ended, lost, opened
 from .command import at_least, cpu_count, fail, flag, parsed, workforce
 from .pictures import picture
-from .points import episode, points, table, tasks, write_tables
+from .points import SCENARIO, episode, points, strangers, table, tasks, write_tables
 from .replays import missing, open_folder, record_again, recorded_episode
 
 PROG = "shepherd-phys evaluate"
@@ -48,7 +48,7 @@ class Evaluate:
     """Numbers of shepherds."""
     sheep: Annotated[int | None, flag("N", "the scenario's")] = None
     """Number of sheep."""
-    scenario: Annotated[str, flag("NAME|FILE|module:Name")] = "paper"
+    scenario: Annotated[str | None, flag("NAME|FILE|module:Name", SCENARIO)] = None
     """A preset's name, a TOML file, or module:Name of a scenario of your own."""
     body: Annotated[str | None, flag("NAME|module:Name", "the scenario's")] = None
     """Body of every shepherd; those that the file describes as such keep their parameters."""
@@ -100,6 +100,8 @@ def main(argv: Sequence[str]) -> int:
 def _main(options: Evaluate, out: TextIO) -> int:
     part, count = read_shard(options.shard)
     grid = points(**{name: getattr(options, name) for name in POINT_KEYS})
+    for line in strangers(grid) if options.scenario is None else ():
+        print(f"{PROG}: {line}", file=sys.stderr)
     seeds = [trial_seed(options.seed, trial) for trial in range(options.trials)]
     todo = campaign.shard(tasks(grid, seeds), part, count)
     replays = None if options.save_replay is None else open_folder(options.save_replay)
@@ -114,9 +116,11 @@ def _main(options: Evaluate, out: TextIO) -> int:
         summary, paths = write_tables(options.out, table(todo, outcome), options.baseline)
         if todo and outcome.rows[0] is not None:
             paths += picture(todo[0], ours.ledger, PROG)
+    if not summary and failures:
+        paths = []  # tables of nothing are written, so that none of an earlier run stays, but not worth a word
     if options.json:
         print(json.dumps(summary, allow_nan=False, indent=1), file=out)
-    else:
+    elif summary:
         print_table(summary, out)
         print_differences(summary, out)
     for path in paths:
@@ -170,8 +174,8 @@ def read_grid(path: Path) -> dict[str, Any]:
         items = value if isinstance(value, list) else [value]
         wrong = any(not isinstance(item, kind) or isinstance(item, bool) for item in items)
         if wrong or not items or (isinstance(value, list) and name not in LISTS):
-            wanted = {int: "whole number", str: "text"}[kind]
-            wanted = f"a list of {wanted}s" if name in LISTS and kind is int else wanted
+            wanted = {int: "a whole number", str: "text"}[kind]
+            wanted = "a list of whole numbers" if name in LISTS and kind is int else wanted
             raise SettingsError(f"{path}: {name} must be {wanted} (given: {value!r})")
         values[name] = tuple(items) if name in LISTS else value
     return values

@@ -44,8 +44,11 @@ def _dispatch(argv: list[str]) -> int:
         print(f"shepherd-phys {__version__}")
         return 0
     if name not in COMMANDS:
+        from shepherd_phys.settings import meant  # only now, as below
+
         problem = f"unknown command {name!r}" if name else "no command"
-        print(f"shepherd-phys: {problem}; commands are {', '.join(COMMANDS)} (see --help)", file=sys.stderr)
+        there = f"commands are {', '.join(COMMANDS)}{meant(name, COMMANDS)}"
+        print(f"shepherd-phys: {problem}; {there} (see --help)", file=sys.stderr)
         return 2
     # imported only now: no command waits for another's libraries
     command = importlib.import_module(f"shepherd_phys.scripts.{name}")

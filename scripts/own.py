@@ -18,7 +18,7 @@ from shepherd_phys.envs.rewards import Scheme, checked, earned, scans_for
 from shepherd_phys.flock import FLOCKS, FlockModel
 from shepherd_phys.lidar import Lidar
 from shepherd_phys.scenario import Scenario, load_scenario
-from shepherd_phys.settings import SettingsError, kind_of
+from shepherd_phys.settings import SettingsError, kind_of, meant
 from shepherd_phys.workers import explain
 from shepherd_phys.world import World
 
@@ -150,6 +150,7 @@ def find_class(name: str, known: dict[str, type[Any]], where: str) -> type[Any]:
         if name not in known:
             raise SettingsError(
                 f"{where}: {name!r} is unknown; there are {', '.join(sorted(known))}, or module:Name of your own"
+                f"{meant(name, known)}"
             )
         return known[name]
     own = imported(name, where)

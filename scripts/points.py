@@ -27,14 +27,29 @@ from shepherd_phys.controllers.evaluation import (
 )
 from shepherd_phys.controllers.summary import difference_columns, paired_differences, summarise, summary_columns
 from shepherd_phys.envs.shepherding import ShepherdingEnv
-from shepherd_phys.scenario import Scenario
-from shepherd_phys.settings import SettingsError, kind_of
+from shepherd_phys.scenario import SCENARIOS, Scenario
+from shepherd_phys.settings import SettingsError, kind_of, meant
 from shepherd_phys.workers import explain
 from shepherd_phys.world import World
 
 from .command import flag
 from .own import find_kinds, find_scenario, imported, of_kinds, source_hash, try_out
 
+SCENARIO = "paper"
+"""What is played where nobody names a scenario."""
+SEEN = (
+    "n_sheep",
+    "box",
+    "goal_radius",
+    "sheep",
+    "shepherds",
+    "flock",
+    "obstacles",
+    "layout",
+    "control_dt",
+    "imperfections",
+)
+"""Fields of a scenario that change what a policy meets. How many flocks, neighbours and shepherds is varied freely."""
 KINDS: dict[str, type] = {
     **dict.fromkeys(COLUMNS, float),
     **dict.fromkeys(("controller", "scenario", "settings_hash", "version"), str),
@@ -98,7 +113,7 @@ class Point:
 def points(
     *,
     controllers: Sequence[str],
-    scenario: str = "paper",
+    scenario: str | None = None,
     flocks: Sequence[int] = (),
     cohesion: Sequence[int] = (),
     shepherds: Sequence[int] = (),
@@ -111,7 +126,8 @@ def points(
 
     Args:
         controllers: names, policy files, or ``module:Name`` of a user's own.
-        scenario: a preset's name, a TOML file, or ``module:Name`` of a scenario or a function that makes one.
+        scenario: a preset's name, a TOML file, or ``module:Name`` of a scenario or a function that makes one; none
+            given: `SCENARIO`.
         flocks: numbers of flocks.
         cohesion: n, neighbours in the flock model's cohesion.
         shepherds: numbers of shepherds.
@@ -125,6 +141,7 @@ def points(
         SettingsError: something is unknown or impossible; the message names it.
         ControllerError: an object given as controller is none.
     """
+    scenario = scenario or SCENARIO
     for name in controllers:
         find_controller(name)
     kinds = find_kinds(body, flock)
@@ -164,7 +181,7 @@ class WorldFlags:
     """Number of shepherds."""
     sheep: Annotated[int | None, flag("N", "the scenario's")] = None
     """Number of sheep."""
-    scenario: Annotated[str, flag("NAME|FILE|module:Name")] = "paper"
+    scenario: Annotated[str | None, flag("NAME|FILE|module:Name", SCENARIO)] = None
     """A preset's name, a TOML file, or module:Name of a scenario of your own."""
     body: Annotated[str | None, flag("NAME|module:Name", "the scenario's")] = None
     """Body of every shepherd."""
@@ -189,6 +206,54 @@ class WorldFlags:
             **lists,
         )
         return point
+
+
+def strangers(points: Iterable[Point]) -> list[str]:
+    """Of each policy from a file that was trained in another scenario than it shall play in, a line that says so.
+
+    What flags have made other than in `SCENARIO` was meant to be so.
+    """
+    lines: dict[str, str] = {}
+    usual = SCENARIOS[SCENARIO]
+    for point in points:
+        if point.controller.endswith(".json") and point.controller not in lines:
+            trained = load_policy(point.controller).spec.scenario
+            told = [
+                _told(trained, name)
+                for name in SEEN
+                if _seen(trained, name) != _seen(point.scenario, name) == _seen(usual, name)
+            ]
+            if told:
+                lines[point.controller] = (
+                    f"{Path(point.controller).name} was trained in another scenario ({', '.join(told)}); this is "
+                    f"{point.scenario_name}: --scenario names another"
+                )
+    return list(lines.values())
+
+
+def _seen(scenario: Scenario, name: str) -> Any:
+    """What of a field counts: of bodies and flock model their kinds, which --body, --flock and --cohesion vary."""
+    value = getattr(scenario, name)
+    if name == "sheep":
+        return {kind_of(body) for body in scenario.sheep_kinds}
+    if name == "shepherds":
+        return {kind_of(body) for body in value}
+    return kind_of(value) if name == "flock" else value
+
+
+def _told(scenario: Scenario, name: str) -> str:
+    value, seen = getattr(scenario, name), _seen(scenario, name)
+    if name == "n_sheep":
+        return f"{value} sheep"
+    if isinstance(seen, set):
+        return f"{name} {', '.join(sorted(seen))}"
+    if name == "layout" and value is not None:
+        count, density = getattr(value, "count", None), getattr(value, "density", None)
+        number = f"count={count}" if count is not None else f"density={density:g}" if density is not None else ""
+        return f"{kind_of(value)}({number})"
+    if name in ("obstacles", "layout", "imperfections"):
+        return f"{'no' if not value else len(value) if name == 'obstacles' else 'some'} {name}"
+    return f"{name} {seen}"
 
 
 def tasks(points: Iterable[Point], seeds: Sequence[int]) -> list[Task]:
@@ -289,7 +354,7 @@ def find_controller(name: str) -> Controller:
     if name not in CONTROLLERS:
         raise SettingsError(
             f"controllers: {name!r} is unknown; there are {', '.join(sorted(CONTROLLERS))}, a policy's .json file, "
-            "or module:Name of your own"
+            f"or module:Name of your own{meant(name, CONTROLLERS)}"
         )
     return CONTROLLERS[name]()
 

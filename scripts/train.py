@@ -18,7 +18,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from shepherd_phys.layouts import Scattered
 from shepherd_phys.learning.folder import BEST, CURVE, POLICY, PRESET, VALIDATION, agree, begin
-from shepherd_phys.learning.preset import Preset, load_preset
+from shepherd_phys.learning.preset import PRESETS, Preset, load_preset
 from shepherd_phys.settings import SettingsError, kind_of
 from shepherd_phys.world import World
 
@@ -38,8 +38,9 @@ class Train:
     A run that was stopped or killed goes on with --resume, exactly as if nothing had happened.
     """
 
-    preset: Annotated[str, flag("NAME|FILE")] = "fast"
-    """How to train: fast, paper or collie, or a TOML file of your own."""
+    preset: Annotated[
+        str, flag("NAME|FILE", text=f"How to train: {', '.join(PRESETS)}, or a TOML file of your own.")
+    ] = "fast"
     reward: Annotated[str | None, flag("NAME|module:Name", "the preset's")] = None
     """Reward scheme: original, any, wild, or a dict name -> (weight, term) of your own."""
     seed: Annotated[int | None, flag("S", "the preset's")] = None

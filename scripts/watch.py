@@ -29,7 +29,7 @@ from shepherd_phys.window import DisplayError, Window
 from .command import at_least, fail, flag, parsed
 from .player import SPEEDS, Player
 from .points import LEAST as WORLD_LEAST
-from .points import WorldFlags
+from .points import WorldFlags, strangers
 from .sources import Live, Recorded, Source
 
 PROG = "shepherd-phys watch"
@@ -142,6 +142,11 @@ def read_options(argv: Sequence[str]) -> Watch:
     if len(options.replay) > MAX_VIEWS or ("replay" in given and not options.replay):
         raise SettingsError(f"--replay: one or two side by side (given: {len(options.replay)})")
     is_page = options.out is not None and options.out.suffix.lower() == PAGE
+    if is_page and not options.replay:
+        raise SettingsError(
+            "--out: a page is made of a replay: evaluate --save-replay DIR leaves one of every episode, then "
+            f"watch --replay DIR/FILE --out {options.out}"
+        )
     if is_page and len(options.replay) != 1:
         raise SettingsError(f"--out: a page is made of one replay, given by --replay (given: {len(options.replay)})")
     for name in (*(OF_LIVE if options.replay else ()), *(OF_PICTURES if is_page else ())):
@@ -174,7 +179,10 @@ def live(options: Watch) -> list[Source]:
         ControllerError: an object given as controller is none.
     """
     # the same one twice is fine: one of them can be led
-    return [Live(options.point(name), options.seed, options.trial, options.rewards) for name in options.controllers]
+    points = [options.point(name) for name in options.controllers]
+    for line in strangers(points) if options.scenario is None else ():
+        print(f"{PROG}: {line}", file=sys.stderr)
+    return [Live(point, options.seed, options.trial, options.rewards) for point in points]
 
 
 def make_player(sources: Sequence[Source], options: Watch) -> Player:

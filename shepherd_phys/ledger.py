@@ -63,7 +63,8 @@ class Ledger:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise CampaignError(f"{self.folder}: cannot be made or written ({error.strerror})") from None
+            why = "it is a file, not a folder" if self.folder.is_file() else error.strerror
+            raise CampaignError(f"{self.folder}: cannot be made or written ({why})") from None
         self._lock = self._take_lock()
         try:
             with self._errors():

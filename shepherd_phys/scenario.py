@@ -23,6 +23,7 @@ from shepherd_phys.settings import (
     SettingsError,
     handed_over,
     listed,
+    meant,
     read_toml,
     settings,
     tagged,
@@ -38,6 +39,8 @@ GOAL_KEEP_OUT, BODY_KEEP_OUT = 2.0, 0.5
 """[m]"""
 OBSTACLE_SUBSTEPS = 3
 """The same among obstacles: with two, a shepherd squeezes one sheep in a hundred through a thin wall (measured)."""
+PRESET_FIELDS = frozenset({"scenario", "ppo", "reward", "budget"})
+"""What a file of training settings holds and no scenario has: the two are easily mistaken."""
 
 
 def _team(value: Any) -> Any:
@@ -243,8 +246,14 @@ class Scenario(Settings):
 
     @classmethod
     def from_toml(cls, path: str | Path, classes: Iterable[Any] = ()) -> Scenario:
-        """Read a scenario from a TOML file; see `from_dict`."""
-        return cls.from_dict(read_toml(path), classes)
+        """Read a scenario from a TOML file; see `from_dict`. Errors name the file."""
+        table = read_toml(path)
+        if not PRESET_FIELDS.isdisjoint(table):
+            raise SettingsError(f"{path}: is a training preset; its scenario is the table [scenario]")
+        try:
+            return cls.from_dict(table, classes)
+        except SettingsError as error:
+            raise SettingsError(f"{path}: {error}") from None
 
 
 SCENARIOS: dict[str, Scenario] = {
@@ -271,7 +280,10 @@ def load_scenario(name_or_path: str | Path, classes: Iterable[Any] = ()) -> Scen
         return SCENARIOS[str(name_or_path)]
     if str(name_or_path).endswith(".toml"):
         return Scenario.from_toml(name_or_path, classes)
-    raise SettingsError(f"scenario: {str(name_or_path)!r} is neither a .toml file nor one of {', '.join(SCENARIOS)}")
+    raise SettingsError(
+        f"scenario: {str(name_or_path)!r} is neither a .toml file nor one of {', '.join(SCENARIOS)}"
+        f"{meant(str(name_or_path), SCENARIOS)}"
+    )
 
 
 __all__ = ["SCENARIOS", "Body", "FlockModel", "Layout", "Obstacle", "Scenario", "load_scenario"]

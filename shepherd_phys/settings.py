@@ -7,6 +7,7 @@ holds what they share: the decorator, ``but``, and the two directions of plain d
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import inspect
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
@@ -20,6 +21,8 @@ from pydantic import ConfigDict
 from shepherd_phys.files import whole_file
 
 T = TypeVar("T")
+MOST_TOLD = 3
+"""Unknown fields that an error names."""
 
 
 class SettingsError(ValueError):
@@ -53,8 +56,16 @@ def settings(cls: type[T]) -> type[T]:
 def _explain(cls: type[Any], error: pydantic.ValidationError) -> str:
     """One line for every field that is wrong: where, what was given, what is allowed."""
     names = [f.name for f in dataclasses.fields(cls)]
-    lines = []
-    for problem in error.errors(include_url=False):
+    problems = error.errors(include_url=False)
+    unknown = {
+        str(problem["loc"][-1]): problem["input"]
+        for problem in problems
+        if problem["type"] == "unexpected_keyword_argument"
+    }
+    lines = [_no_such_field(cls, unknown)] if unknown else []
+    for problem in problems:
+        if problem["type"] == "unexpected_keyword_argument":
+            continue  # all of them are told at once
         if problem["type"] == "default_factory_not_called":
             continue  # its default follows from a field that is wrong, which is told
         path = list(problem["loc"])
@@ -62,11 +73,38 @@ def _explain(cls: type[Any], error: pydantic.ValidationError) -> str:
             path[0] = names[path[0]]  # a positional argument: say which field it fills
         where = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in path)
         message = problem["msg"].removeprefix("Value error, ")
-        if problem["type"] == "unexpected_keyword_argument":
-            message = f"there is no such field; fields are {', '.join(names)}"
         whole = not path or problem["type"] == "missing"
         lines.append(f"{cls.__name__}{where}: {message}" + ("" if whole else f" (given: {_brief(problem['input'])})"))
     return "; ".join(lines)
+
+
+def _no_such_field(cls: type[Any], unknown: Mapping[str, Any]) -> str:
+    """The error for unknown fields: a few of them, and once what there is; one alone with what may have been meant."""
+    names = [f.name for f in dataclasses.fields(cls)]
+    shown = f"{cls.__name__}.{', '.join(list(unknown)[:MOST_TOLD])}"
+    more = f" and {len(unknown) - MOST_TOLD} more" if len(unknown) > MOST_TOLD else ""
+    there = f"fields are {', '.join(names)}"
+    if len(unknown) > 1:
+        return f"{shown}{more}: there are no such fields; {there}"
+    ((name, value),) = unknown.items()
+    parts = {
+        part: info.annotation for part, info in cls.__pydantic_fields__.items() if inspect.isclass(info.annotation)
+    }
+    inside = [f"{part}.{name}" for part, kind in parts.items() if name in getattr(kind, "__pydantic_fields__", ())]
+    guess = f"; did you mean {' or '.join(inside)}?" if inside else meant(name, names)
+    return f"{shown}: there is no such field (given: {_brief(value)}){guess or ';'} {there}"
+
+
+def meant(word: str, known: Iterable[str], before: str = "") -> str:
+    """``; did you mean NAME?``, the known name that a misspelled one is nearest to; nothing where none is near.
+
+    Args:
+        word: the misspelled name.
+        known: the names that there are.
+        before: stands before the name that is told.
+    """
+    near = difflib.get_close_matches(word, list(known), n=1, cutoff=0.7)
+    return f"; did you mean {before}{near[0]}?" if near else ""
 
 
 def _brief(value: object) -> str:
@@ -91,10 +129,7 @@ class Settings:
         fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}  # type: ignore[arg-type]
         unknown = [name for name in changes if name not in fields]
         if unknown:
-            raise SettingsError(
-                f"{type(self).__name__}.{unknown[0]}: there is no such field "
-                f"(given: {_brief(changes[unknown[0]])}); fields are {', '.join(fields)}"
-            )
+            raise SettingsError(_no_such_field(type(self), {name: changes[name] for name in unknown}))
         return type(self)(**{**fields, **changes})
 
     def to_dict(self) -> dict[str, Any]:

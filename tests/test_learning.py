@@ -383,7 +383,11 @@ def test_a_preset_may_mix_worlds_and_price_effort():
     ("text", "said"),
     [
         ("reward = 'wold'", "'wold' is not one of original, any, wild"),
-        ("rewards = 'wild'", "rewards: there is no such field"),
+        ("rewards = 'wild'", "rewards: there is no such field .*did you mean reward.;? "),
+        (
+            "n_steps = 3",
+            "Preset.n_steps: there is no such field .given: 3.; did you mean scenario.n_steps or ppo.n_steps.;? ",
+        ),
         ("decision_interval = 1001", "decision_interval.*less than or equal to 1000"),
         ("budget = 0", "budget.*greater than or equal to 1"),
         ("team_sizes = []", "team_sizes"),

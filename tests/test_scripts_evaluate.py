@@ -11,7 +11,9 @@ import sys
 import time
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import tomli_w
 from hypothesis import given, settings
@@ -21,10 +23,16 @@ from shepherd_phys import __version__, campaign
 from shepherd_phys.bodies import Disc
 from shepherd_phys.campaign import Ledger
 from shepherd_phys.controllers.evaluation import COLUMNS, METRICS, trial_seed
+from shepherd_phys.controllers.network import SectorNetwork
+from shepherd_phys.controllers.policy_files import Acting, PolicySpec, write_policy
 from shepherd_phys.controllers.summary import difference_columns, summary_columns
-from shepherd_phys.scripts import evaluate, main, pictures
+from shepherd_phys.layouts import Scattered
+from shepherd_phys.lidar import Lidar
+from shepherd_phys.scenario import SCENARIOS
+from shepherd_phys.scripts import command, evaluate, main, pictures
+from shepherd_phys.scripts.campaigns import _are_compiled
 from shepherd_phys.scripts.evaluate import GRID_KEYS, LISTS, read_options, read_shard
-from shepherd_phys.scripts.points import points
+from shepherd_phys.scripts.points import points, strangers
 from shepherd_phys.settings import SettingsError
 
 TINY = {"n_sheep": 6, "n_flocks": 2, "shepherds": 2, "n_steps": 6}
@@ -157,7 +165,8 @@ def run(*words, workers=0):
 
 def mistakes(err):
     """Lines on standard error but for the progress of a slow machine and for what the user's module prints."""
-    return [line for line in err.splitlines() if " episodes: " not in line and not line.startswith("a module that")]
+    usual = ("a module that", "compiling the kernels")
+    return [line for line in err.splitlines() if " episodes: " not in line and not line.startswith(usual)]
 
 
 def read(path):
@@ -412,8 +421,56 @@ def test_failed_episodes_are_named_and_the_others_complete(folder, in_process, c
     assert len(lines) == 2
     for line, seed in zip(lines, (trial_seed(20_000, 0), trial_seed(20_000, 1)), strict=True):
         assert f"mine:Bad, n_flocks 2, cohesion 40, n_shepherds 2, n_sheep 6, scenario tiny.toml, seed {seed}: " in line
-        assert "ControllerError: controller Bad, step 0: the action holds a NaN" in line
+        assert "ControllerError: controller mine:Bad, step 0: the action holds a NaN" in line
     assert {row["controller"] for row in read("results/episodes.csv")} == {"idle"}
+
+
+def test_without_any_episode_there_is_no_table(folder, in_process, capsys):
+    assert run("--controllers", "mine:Bad") == 1
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert len(mistakes(said.err)) == 2
+    assert read("results/episodes.csv") == []  # and none of an earlier run stays
+
+
+def test_a_policy_that_was_trained_elsewhere_is_told_of(folder, in_process, capsys):
+    lidar, network = Lidar(beams=32, sectors=8), SectorNetwork(features=2, hidden=2, latent=2)
+    rng = np.random.default_rng(0)
+    weights = {name: rng.normal(size=shape).astype(np.float32) for name, shape in network.shapes(lidar).items()}
+    trained = SCENARIOS["paper"].but(n_sheep=6, shepherds=1, n_flocks=1, layout=Scattered(count=12))
+    write_policy("mine.json", PolicySpec(trained, lidar, network, Acting(), {}, {}), weights)
+    told = "mine.json was trained in another scenario (6 sheep, Scattered(count=12)); this is paper"
+    played = partial(points, controllers=["mine.json", "idle"], flocks=[1, 2])
+    (line,) = strangers(played())
+    assert line.startswith(told)
+    assert "(Scattered(count=12))" in strangers(played(sheep=6))[0] and "(Scat" in strangers(played(sheep=9))[0]
+    usual = PolicySpec(SCENARIOS["paper"].but(n_flocks=1), lidar, network, Acting(), {}, {})
+    write_policy("usual.json", usual, weights)
+    assert strangers(points(controllers=["usual.json"], flocks=[3], shepherds=[1], cohesion=[5], sheep=9)) == []
+    assert run("--controllers", "mine.json") == 0  # the scenario is named
+    assert mistakes(capsys.readouterr().err) == []
+
+
+def test_a_note_of_evaluate_goes_to_standard_error(folder, monkeypatch, capsys):
+    monkeypatch.setattr(evaluate, "strangers", lambda grid: [f"{point.scenario_name} is strange" for point in grid])
+    assert main.main(["evaluate", "--controllers", "idle", "--workers", "1", "--out", "tiny.toml"]) == 2
+    assert mistakes(capsys.readouterr().err)[0] == "shepherd-phys evaluate: paper is strange"
+
+
+def test_compiled_kernels_are_found_where_numba_keeps_them(folder, in_process, monkeypatch, tmp_path):
+    assert run("--controllers", "idle", "--out", "a") == 0
+    assert _are_compiled()
+    kept = SimpleNamespace(stats=SimpleNamespace(cache_path=str(tmp_path / "empty")))
+    monkeypatch.setattr("shepherd_phys.scripts.campaigns.neighbours.surroundings", kept)
+    assert not _are_compiled()
+
+
+def test_a_campaign_that_goes_on_says_so(monkeypatch, capsys):
+    monkeypatch.setattr(command, "LOG_SECONDS", -1.0)
+    for done, pace in ((0, "starting"), (3, "continuing, 3 of 16 there")):
+        with command.progress_bar() as report:
+            report(campaign.Progress(16, done, 0))
+        assert f"{done}/16 episodes: {pace}\n" in capsys.readouterr().err
 
 
 def test_without_pygame_there_is_no_picture(folder, in_process, monkeypatch, capsys):
@@ -539,7 +596,10 @@ MISTAKES = [
     ("--scenario nowhere", "scenario: 'nowhere' is neither a .toml file nor one of paper"),
     ("--scenario nowhere.toml", "nowhere.toml: cannot be read (No such file or directory)"),
     ("--scenario bad.toml", "bad.toml: is not a TOML file"),
-    ("--scenario odd.toml", "Scenario.n_shep: there is no such field"),
+    ("--scenario odd.toml", "odd.toml: Scenario.n_shep: there is no such field (given: 3); did you mean n_sheep?"),
+    ("--scenario many.toml", "many.toml: Scenario.a, b, c and 2 more: there are no such fields; fields are n_sheep, "),
+    ("--scenario preset.toml", "preset.toml: is a training preset; its scenario is the table [scenario]"),
+    ("--scenario fense", "; did you mean fence?"),
     (
         "--body nobody",
         "body: 'nobody' is unknown; there are DifferentialDrive, Disc, Flyer, PolygonRobot, Unicycle, or",
@@ -564,15 +624,19 @@ MISTAKES = [
     ("--grid bad.toml", "bad.toml: is not a TOML file"),
     ("--grid odd.toml", "odd.toml: n_shep is unknown; a grid sets controllers, flocks"),
     ("--grid words.toml", "words.toml: flocks must be a list of whole numbers (given: ['two'])"),
-    ("--grid true.toml", "true.toml: trials must be whole number (given: True)"),
+    ("--grid true.toml", "true.toml: trials must be a whole number (given: True)"),
     ("--grid none.toml", "none.toml: flocks must be a list of whole numbers (given: [])"),
     ("--grid zero.toml", "flocks: 0 is impossible"),
     ("--grid flocks.toml --flocks 1", "--flocks is given and flocks.toml sets flocks too: leave one of them out"),
-    ("--out tiny.toml", "tiny.toml: cannot be made or written"),
+    ("--out tiny.toml", "tiny.toml: cannot be made or written (it is a file, not a folder)"),
     ("--out tiny.toml/deeper", "cannot be made or written"),
     ("--out other", "other/ledger.sqlite: holds rows of shepherd_phys 0.0.0, this is"),
     ("--out used", "used: is in use by another run; wait for it or choose another folder"),
-    ("--flcks 1", "Unrecognized options: --flcks"),
+    ("--flcks 1", "Unrecognized options: --flcks, 1; did you mean --flocks? (see"),
+    ("--save_replai x", "; did you mean --save-replay? (see"),
+    ("--obstacles 12", "Unrecognized options: --obstacles, 12 (see shepherd-phys evaluate --help)"),
+    ("--controllers strombon", "; did you mean strombom?"),
+    ("--body Flier", "; did you mean Flyer?"),
     ("idle", "Unrecognized options: idle"),
 ]
 
@@ -581,6 +645,8 @@ MISTAKES = [
 def test_mistakes_are_one_clear_line(folder, capsys, words, message):
     Path("bad.toml").write_text("n_sheep = = 3")
     Path("odd.toml").write_text("n_shep = 3")
+    Path("many.toml").write_text("".join(f"{name} = 1\n" for name in "abcde"))
+    Path("preset.toml").write_text(tomli_w.dumps({"reward": "wild", "ppo": {"n_steps": 50}, "scenario": TINY}))
     Path("herd.toml").write_text(tomli_w.dumps(HERD))
     Path("post.toml").write_text(tomli_w.dumps({**TINY, "obstacles": [{"kind": "mine:Post"}]}))
     Path("broken.toml").write_text(tomli_w.dumps({**TINY, "shepherds": [{"kind": "mine:Cart", "size": -1.0}]}))
@@ -668,6 +734,8 @@ def test_front_door(capsys):
     assert "evaluate" in capsys.readouterr().out
     assert main.main(["--version"]) == 0
     assert capsys.readouterr().out == f"shepherd-phys {__version__}\n"
+    assert main.main(["evalute"]) == 2
+    assert "; did you mean evaluate? (see --help)" in capsys.readouterr().err
     for argv, problem in (([], "no command"), (["dance"], "unknown command 'dance'")):
         assert main.main(argv) == 2
         said = capsys.readouterr()

@@ -7,7 +7,7 @@ import pytest
 
 from shepherd_phys.layouts import Fenced, Scattered
 from shepherd_phys.learning.folder import PRESET
-from shepherd_phys.learning.preset import Preset, load_preset
+from shepherd_phys.learning.preset import PRESETS, Preset, load_preset
 from shepherd_phys.scripts.command import parsed
 from shepherd_phys.scripts.train import Train, asked, main, prepare
 
@@ -73,3 +73,10 @@ def test_mistakes_are_one_line_before_anything_is_made(words, message, tmp_path,
     assert said.count("\n") == 1
     assert message in said
     assert list(tmp_path.iterdir()) == []
+
+
+def test_help_names_every_preset(capsys):
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    said = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert f"How to train: {', '.join(PRESETS)}, or a TOML file of your own." in said

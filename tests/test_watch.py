@@ -170,7 +170,7 @@ def test_without_pygame(monkeypatch, capsys):
         (["--replay", "none.npz"], "none.npz"),
         (["--replay", "a.npz", "--seed", "5"], "--seed: does not go with --replay"),
         (["--replay", "a.npz", "b.npz", "c.npz"], "--replay: one or two side by side (given: 3)"),
-        (["--out", "a.html"], "--out: a page is made of one replay, given by --replay (given: 0)"),
+        (["--out", "a.html"], "--out: a page is made of a replay: evaluate --save-replay DIR leaves one"),
         (["--replay", "a.npz", "--out", "a.html", "--dark"], "--dark: does not go with --out a.html"),
         (["--camera", "near"], "--camera"),
         ([], "no display for a window (neither DISPLAY nor WAYLAND_DISPLAY is set)"),

@@ -34,7 +34,7 @@ from shepherd_phys.envs.rewards import (
 from shepherd_phys.lidar import Channel, Lidar
 from shepherd_phys.mirror import Side, check
 from shepherd_phys.scenario import SCENARIOS, Scenario
-from shepherd_phys.settings import Foreign, Settings, SettingsError, listed, read_toml, settings, write_toml
+from shepherd_phys.settings import Foreign, Settings, SettingsError, listed, meant, read_toml, settings, write_toml
 
 FOLDER = Path(__file__).parent / "presets"
 MOST_NUMBERS = 2**32
@@ -444,4 +444,6 @@ def load_preset(name_or_path: str | Path, classes: Iterable[Any] = ()) -> Preset
         return Preset.from_toml(PRESETS[name])
     if name.endswith(".toml"):
         return Preset.from_toml(name, classes)
-    raise SettingsError(f"preset: {name!r} is neither a .toml file nor one of {', '.join(PRESETS)}")
+    raise SettingsError(
+        f"preset: {name!r} is neither a .toml file nor one of {', '.join(PRESETS)}{meant(name, PRESETS)}"
+    )
