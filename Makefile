@@ -38,6 +38,7 @@ benchmark: build/.installed  ## measure the speed of the simulator
 
 docs: build/.installed  ## the guide as pages, in build/docs/html
 	$(BIN)/python -m sphinx -W --keep-going --quiet -d build/docs/doctrees docs build/docs/html
+	@echo build/docs/html/index.html
 
 reproduce: build/.installed  ## run the paper's experiments (hours; continues) and put the results into docs/reproduction/
 	$(BIN)/shepherd-phys reproduce all --literal --workers $(WORKERS) --out results/reproduce

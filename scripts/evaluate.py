@@ -102,17 +102,18 @@ def _main(options: Evaluate, out: TextIO) -> int:
     grid = points(**{name: getattr(options, name) for name in POINT_KEYS})
     for line in strangers(grid) if options.scenario is None else ():
         print(f"{PROG}: {line}", file=sys.stderr)
-    seeds = [trial_seed(options.seed, trial) for trial in range(options.trials)]
-    todo = campaign.shard(tasks(grid, seeds), part, count)
+    trials = {trial_seed(options.seed, trial): trial for trial in range(options.trials)}
+    todo = campaign.shard(tasks(grid, [*trials]), part, count)
     replays = None if options.save_replay is None else open_folder(options.save_replay)
+    work = episode if replays is None else partial(recorded_episode, str(replays), trials)
     workers = workforce(PROG, options.workers, options.scheduler)
     with opened(options.out, todo, workers=workers, timeout=options.timeout, gather=options.gather) as ours:
-        outcome = ours.run(todo, episode if replays is None else partial(recorded_episode, str(replays)))
+        outcome = ours.run(todo, work)
         failures = list(outcome.failures)
         if replays is not None:
             kept = {task.key: row for task, row in zip(todo, outcome.rows, strict=True) if row is not None}
-            again = missing(replays, [task for task in todo if task.key in kept])
-            failures += record_again(replays, again, [kept[task.key] for task in again], **ours.how)
+            again = missing(replays, trials, [task for task in todo if task.key in kept])
+            failures += record_again(replays, trials, again, [kept[task.key] for task in again], **ours.how)
         summary, paths = write_tables(options.out, table(todo, outcome), options.baseline)
         if todo and outcome.rows[0] is not None:
             paths += picture(todo[0], ours.ledger, PROG)
@@ -125,7 +126,7 @@ def _main(options: Evaluate, out: TextIO) -> int:
         print_differences(summary, out)
     for path in paths:
         print(path, file=sys.stderr if options.json else out)
-    unrecorded = 0 if replays is None else len(missing(replays, todo))
+    unrecorded = 0 if replays is None else len(missing(replays, trials, todo))
     if replays is not None:
         print(f"{len(todo) - unrecorded} replays in {options.save_replay}", file=sys.stderr if options.json else out)
         if unrecorded > len(failures):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,26 +26,32 @@ MAX_NAME = 100
 """Characters of a name, without hash and seed: file systems allow 255 bytes."""
 
 
-def file_name(point: Point, settings_hash: str, seed: int) -> str:
-    """What an episode's replay is called: controller and point in words, a part of the hash of all settings, seed."""
+def file_name(point: Point, settings_hash: str, trial: int, seed: int) -> str:
+    """What an episode's replay is called: controller and point in words, part of the hash of all settings, trial, seed.
+
+    The trial says which one it is among those of a root seed; the seed keeps the trials of other root seeds apart.
+    """
     labels = point.labels
     words = [Path(labels["controller"]).stem if labels["controller"].endswith(".json") else labels["controller"]]
     words += [Path(labels["scenario"]).stem, f"{labels['n_flocks']}-flocks"]
     words += [] if labels["cohesion"] is None else [f"n{labels['cohesion']}"]
     words += [f"{labels['n_shepherds']}-shepherds", f"{labels['n_sheep']}-sheep"]
     name = "_".join(re.sub(r"[^A-Za-z0-9.-]+", "-", word).strip(".-") or "own" for word in words)
-    return f"{name[:MAX_NAME]}_{settings_hash[:8]}_seed-{seed}{SUFFIX}"
+    return f"{name[:MAX_NAME]}_{settings_hash[:8]}_trial-{trial}_seed-{seed}{SUFFIX}"
 
 
-def recorded_episode(folder: str, point: Point, seed: int) -> dict[str, Any]:
-    """Run one episode of a point and leave its replay in ``folder``: the work of a campaign; see `points.episode`."""
+def recorded_episode(folder: str, trials: Mapping[int, int], point: Point, seed: int) -> dict[str, Any]:
+    """Run one episode of a point and leave its replay in ``folder``: the work of a campaign; see `points.episode`.
+
+    ``trials`` has the trial's number of each seed.
+    """
     controller = find_controller(point.controller)
     env = ShepherdingEnv(point.scenario, rewards=REWARDS, lidar=controller.lidar)
     try:
         row, replay = recorded(controller, env, seed, name=point.controller, scenario_name=point.scenario_name)
     finally:
         env.close()
-    save_replay(replay, Path(folder, file_name(point, point.settings_hash(), seed)))
+    save_replay(replay, Path(folder, file_name(point, point.settings_hash(), trials[seed], seed)))
     return row
 
 
@@ -64,16 +70,23 @@ def open_folder(folder: Path) -> Path:
     return folder.absolute()
 
 
-def missing(folder: Path, tasks: Sequence[Task]) -> list[Task]:
-    """The tasks that have no replay in the folder."""
-    return [task for task in tasks if not (folder / file_name(task.spec, task.settings_hash, task.seed)).exists()]
+def missing(folder: Path, trials: Mapping[int, int], tasks: Sequence[Task]) -> list[Task]:
+    """The tasks that have no replay in the folder; ``trials`` has the trial's number of each seed."""
+
+    def place(task: Task) -> Path:
+        return folder / file_name(task.spec, task.settings_hash, trials[task.seed], task.seed)
+
+    return [task for task in tasks if not place(task).exists()]
 
 
-def record_again(folder: Path, tasks: Sequence[Task], rows: Sequence[dict[str, Any]], **how: Any) -> list[Failure]:
+def record_again(
+    folder: Path, trials: Mapping[int, int], tasks: Sequence[Task], rows: Sequence[dict[str, Any]], **how: Any
+) -> list[Failure]:
     """Run episodes that have a row already once more, for their replays; the rows stay as they are.
 
     Args:
         folder: where replays go.
+        trials: the trial's number of each seed.
         tasks: to be run.
         rows: that they have.
         how: further arguments of `campaign.run`: workers, timeout, report.
@@ -87,7 +100,7 @@ def record_again(folder: Path, tasks: Sequence[Task], rows: Sequence[dict[str, A
     if not tasks:
         return []
     with tempfile.TemporaryDirectory(prefix="shepherd-phys-") as scratch, Ledger(scratch, __version__) as ledger:
-        outcome = campaign.run(tasks, partial(recorded_episode, str(folder)), ledger=ledger, **how)
+        outcome = campaign.run(tasks, partial(recorded_episode, str(folder), trials), ledger=ledger, **how)
     failures = list(outcome.failures)
     for task, row, kept in zip(tasks, outcome.rows, rows, strict=True):
         if row is not None and row != kept:

@@ -10,7 +10,6 @@ from typing import Protocol
 
 import numpy as np
 
-from shepherd_phys.controllers import Policy
 from shepherd_phys.controllers.evaluation import ControllerError, checked_action, trial_seed
 from shepherd_phys.envs.rewards import SCHEMES, earning_beams
 from shepherd_phys.envs.shepherding import ShepherdingEnv
@@ -89,6 +88,12 @@ def _in_one_line() -> Iterator[None]:
         raise SettingsError(explain(error)) from None
 
 
+def shown_name(controller: str) -> str:
+    """A controller's name for a title: of a policy's file its folder and its name, since each run has a ``best``."""
+    path = Path(controller)
+    return "/".join([*path.parts[-2:-1], path.stem]).lstrip("/") if path.suffix == ".json" else controller
+
+
 class Live:
     """An episode that is being played: trial i of ``evaluate --seed``, step for step, while nobody interferes.
 
@@ -108,7 +113,7 @@ class Live:
     def __init__(self, point: Point, seed: int, trial: int = 0, rewards: str = "wild") -> None:
         self.scenario = point.scenario
         self.controller = find_controller(point.controller)
-        self.name = self.controller.name if isinstance(self.controller, Policy) else point.controller
+        self.name = shown_name(point.controller)
         self._seed, self._trial = seed, trial
         self._scheme = SCHEMES[rewards]
         # a controller that needs no scan is given one nevertheless: its beams are to be seen
@@ -159,7 +164,7 @@ class Recorded:
     def __init__(self, replay: Replay) -> None:
         self.replay = replay
         self.scenario = replay.scenario
-        self.name = Path(replay.controller).stem
+        self.name = shown_name(replay.controller)
         self.label = f"seed {replay.seed}"
         # what each term has given until a state: 0 at first
         self._sums = {name: np.concatenate([[0.0], np.cumsum(values)]) for name, values in replay.rewards.items()}

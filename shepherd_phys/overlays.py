@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -65,41 +66,69 @@ def draw_beams(
         canvas.discs(color, ends, 0.5 + 0.75 * width)
 
 
+@dataclass(frozen=True)
+class Seen:
+    """What there is to see in a picture, as the boxes round what is drawn: (.., 2, 2) [px], least and greatest x, y.
+
+    Attributes:
+        moving: (K, 2, 2) sheep, shepherds, the goal.
+        weights: (K,) how much each of them matters.
+        obstacles: (O, 2, 2).
+    """
+
+    moving: Floats
+    weights: Floats
+    obstacles: Floats
+
+
 class Corner:
     """The corner in which the panel stands, from picture to picture: it stays until something walks in behind it.
 
-    Then it goes where least is hidden, and of such corners to the one with least within `CALM` pixels, so that it
-    neither hides what there is to see nor jumps to and fro.
+    Then, as in the first picture, it goes where least is hidden; of such corners to the one with the fewest obstacles,
+    which stay there for good; of those to the one with least within `CALM` pixels. So it neither hides what there is
+    to see nor jumps to and fro.
     """
 
     def __init__(self) -> None:
-        self.name = CORNERS[0]
+        self.name = ""
 
-    def __call__(self, boxes: Mapping[str, Box], at: Floats, weights: Floats) -> str:
+    def __call__(self, boxes: Mapping[str, Box], seen: Seen) -> str:
         """Choose one.
 
         Args:
             boxes: what the panel would cover, of each corner.
-            at: (K, 2) what is to be seen [px].
-            weights: (K,) how much it matters.
+            seen: what is to be seen.
 
         Returns:
             its name.
         """
-        covered = hidden(boxes[self.name], at, weights)
+        covered = hidden(boxes[self.name], seen.moving, seen.weights) if self.name else np.inf
         if covered > 0.0:
-            costs = {name: (hidden(box, at, weights), hidden(box, at, weights, CALM)) for name, box in boxes.items()}
+            each = np.ones(len(seen.obstacles))
+            costs = {
+                name: (
+                    hidden(box, seen.moving, seen.weights),
+                    hidden(box, seen.obstacles, each),
+                    hidden(box, seen.moving, seen.weights, CALM),
+                )
+                for name, box in boxes.items()
+            }
             best = min(costs, key=costs.__getitem__)
             if costs[best][0] < covered:
                 self.name = best
         return self.name
 
 
-def hidden(box: Box, at: Floats, weights: Floats, around: float = 0.0) -> float:
-    """The weight (K,) of what stands at (K, 2) within ``around`` of a box [px]."""
+def hidden(box: Box, extents: Floats, weights: Floats, around: float = 0.0) -> float:
+    """The weight (K,) of those extents (K, 2, 2), of which a part is within ``around`` of a box [px]."""
     left, top, width, height = box
     low, high = (left - around, top - around), (left + width + around, top + height + around)
-    return float(weights[((at > low) & (at < high)).all(axis=1)].sum())
+    return float(weights[((extents[:, 1] > low) & (extents[:, 0] < high)).all(axis=1)].sum())
+
+
+def extents(at: Floats, reach: Floats) -> Floats:
+    """The boxes (K, 2, 2) round discs: their middles (K, 2), their radii (K,) [px]."""
+    return np.stack([at - reach[:, None], at + reach[:, None]], axis=1)
 
 
 def text_height(canvas: Canvas) -> int:
@@ -187,7 +216,7 @@ class Panel:
 def draw_panel(
     canvas: Canvas,
     state: WorldState,
-    camera: Camera,
+    seen: Seen,
     rewards: Mapping[str, float] | None,
     theme: Theme,
     *,
@@ -199,7 +228,7 @@ def draw_panel(
     Args:
         canvas: to draw on.
         state: of which it tells.
-        camera: of the picture.
+        seen: what it is not to hide.
         rewards: what each term has given, weighted.
         theme: the colours.
         corner: of the panel; None: there is none.
@@ -210,10 +239,8 @@ def draw_panel(
     under = draw_title(canvas, title, theme, canvas.size[0] - beside - 2 * EDGE) if title else 0
     if panel is None or corner is None or not panel.size[0]:
         return
-    points = np.concatenate([state.sheep_pos, state.shepherd_pos, state.goal_pos[None]])
-    weights = np.repeat([1.0, MATTERS, MATTERS], [state.n_sheep, state.n_shepherds, 1])
     boxes = panel.boxes(canvas, under)
-    panel.draw(canvas, boxes[corner(boxes, camera.to_pixels(points, canvas.size), weights)])
+    panel.draw(canvas, boxes[corner(boxes, seen)])
 
 
 def draw_title(canvas: Canvas, title: str, theme: Theme, width: float) -> int:

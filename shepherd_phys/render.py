@@ -21,13 +21,17 @@ from shepherd_phys.canvas import Canvas, Floats, Picture, lettering, mixed, png
 from shepherd_phys.files import whole_file
 from shepherd_phys.lidar import Scan
 from shepherd_phys.outlines import Same, of_body, of_obstacles
-from shepherd_phys.overlays import Corner, draw_beams, draw_panel
+from shepherd_phys.overlays import MATTERS, Corner, Seen, draw_beams, draw_panel, extents
 from shepherd_phys.palette import THEMES, Theme
 from shepherd_phys.scenario import Scenario
 from shepherd_phys.state import WorldState, unit
 
 LOOK_AHEAD = 1.0
 """[s]: a shepherd's pointer ends where its velocity takes it in this time."""
+BEYOND = 1.5
+"""Radii that a shepherd is drawn wide: rotors, wheels and a shadow stand out."""
+BESIDE = 6.0
+"""[px] that the panel keeps from a shepherd, ring and edge included."""
 
 
 # --- what stands still ---
@@ -170,6 +174,24 @@ def _draw_drive(canvas: Canvas, body: Any, middle: Floats, size: float, nose: Fl
             canvas.hull(theme.ink, wheel, max(0.14 * size, 0.75))
 
 
+def _seen(state: WorldState, camera: Camera, size: Size, reach: Floats, sizes: Floats) -> Seen:
+    """What a picture shows, by the radii of sheep and shepherds in it [px]: bodies, pointers, obstacles."""
+    scale, to_pixels = size[0] / camera.width, camera.to_pixels
+    at, ways = to_pixels(state.shepherd_pos, size), state.shepherd_vel * (1, -1) * LOOK_AHEAD * scale
+    round_bodies = extents(at, BEYOND * sizes + BESIDE)
+    round_tips = extents(at + ways, sizes + BESIDE)
+    shepherds = np.stack(
+        [np.minimum(round_bodies[:, 0], round_tips[:, 0]), np.maximum(round_bodies[:, 1], round_tips[:, 1])], axis=1
+    )
+    goal = to_pixels(state.goal_pos[None], size)
+    outlines = [(to_pixels(points, size), radius * scale) for points, radius in of_obstacles(Same(state.obstacles))]
+    return Seen(
+        np.concatenate([extents(to_pixels(state.sheep_pos, size), reach), shepherds, extents(goal, np.zeros(1))]),
+        np.repeat([1.0, MATTERS, MATTERS], [state.n_sheep, state.n_shepherds, 1]),
+        np.array([(at.min(axis=0) - grown, at.max(axis=0) + grown) for at, grown in outlines]).reshape(-1, 2, 2),
+    )
+
+
 def draw(state: WorldState, size: Size = (640, 640), **options: Any) -> Picture:
     """Draw the world: the same picture for the same arguments, without a display.
 
@@ -263,11 +285,13 @@ def paint(
     draw_beams(canvas, state, camera, scan, earning, look)
     flock = scenario.sheep_bodies if scenario is not None else ()
     team = scenario.shepherds if scenario is not None else ()
-    _draw_sheep(canvas, state, sheep, np.maximum(state.sheep_radius * scale, least), threatened, flock, look)
+    reach = np.maximum(state.sheep_radius * scale, least)
+    _draw_sheep(canvas, state, sheep, reach, threatened, flock, look)
     sizes = np.maximum(state.shepherd_radius * scale, 1.8 * least)
     _draw_shepherds(canvas, state, shepherds, sizes, scale, team, chosen, look)
     corner = panel if isinstance(panel, Corner) else Corner() if panel else None
-    draw_panel(canvas, state, camera, rewards, look, corner=corner, title=title)
+    seen = _seen(state, camera, size, reach, sizes)
+    draw_panel(canvas, state, seen, rewards, look, corner=corner, title=title)
     return canvas
 
 

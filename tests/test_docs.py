@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from shepherd_phys.learning.preset import load_preset
+
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -56,3 +58,15 @@ def test_links_between_pages_lead_somewhere():
     for page in PAGES:
         for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
             assert (page.parent / target).exists(), f"{page.name}: {target}"
+
+
+@pytest.mark.parametrize("page", ["first-steps.md", "training.md", "extending.md"])
+def test_presets_that_are_shown_are_such(page, tmp_path):
+    (shown,) = blocks(ROOT / "docs" / page, "toml")
+    (tmp_path / "shown.toml").write_text(shown, encoding="utf-8")
+    preset = load_preset(tmp_path / "shown.toml")
+    again = tmp_path / "whole.toml"
+    preset.to_toml(again)
+    assert load_preset(again) == preset
+    for name in re.findall(r"^\[?(\w+)", shown, re.MULTILINE):
+        assert name in again.read_text(encoding="utf-8")

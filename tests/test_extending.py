@@ -39,7 +39,7 @@ def folder(tmp_path, monkeypatch):
     """A folder away from the checkout, with a user's one file."""
     (tmp_path / "my_file.py").write_text("\n".join(MINE), encoding="utf-8")
     (tmp_path / "tiny.toml").write_text(tomli_w.dumps(TINY["scenario"]))
-    (tmp_path / "quick.toml").write_text(tomli_w.dumps(TINY))
+    (tmp_path / "hexapod.toml").write_text(tomli_w.dumps(TINY))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [p for p in sys.path if p not in ("", str(ROOT))])
     yield tmp_path
@@ -73,7 +73,7 @@ def test_everything_of_a_users_own_plays_by_its_name(folder):
 
 
 def test_a_policy_for_a_users_body_is_trained_and_played_from_the_command_line(folder, capsys):
-    shell("train --preset quick.toml --body my_file:Hexapod --out runs/hexapod --workers 2")
+    shell("train --preset hexapod.toml --body my_file:Hexapod --out runs/hexapod --workers 2")
     told = json.loads(Path("runs/hexapod/best.json").read_text())
     assert {body["kind"] for body in told["scenario"]["shepherds"]} == {"my_file:Hexapod"}
     policy = load_policy("runs/hexapod/best.json")  # imports nothing
@@ -105,7 +105,7 @@ def test_a_policy_is_trained_in_a_scenario_of_a_users_own_classes_and_goes_on(fo
         "STREWN = FIELD.but(n_sheep=6, n_steps=60, layout=Crosses(2), flock=Lazy())\n"
     )
     own = ["--scenario", "mine:STREWN", "--reward", "my_file:CALM", "--out", "runs/strewn", "--workers", "1"]
-    assert train(["--preset", "quick.toml", *own]) == 0
+    assert train(["--preset", "hexapod.toml", *own]) == 0
     assert train(["--resume", "--budget", "4800", "--out", "runs/strewn", "--workers", "1"]) == 2
     assert "is a class of somebody's own and was not handed over" in capsys.readouterr().err
     assert train(["--resume", "--budget", "4800", "--out", "runs/strewn", "--scenario", "mine:STREWN"]) == 2
@@ -181,7 +181,7 @@ FOGGY = SCENARIOS["small"].but(layout=fog)
 )
 def test_train_tells_in_one_line_what_a_class_lacks_and_makes_no_folder(flags, message, folder, capsys):
     Path("my_file.py").write_text(BROKEN)
-    assert train(["--preset", "quick.toml", "--out", "runs/x", *flags.split()]) == 2
+    assert train(["--preset", "hexapod.toml", "--out", "runs/x", *flags.split()]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("shepherd-phys train: ") and message in line
     assert not Path("runs").exists()
@@ -212,7 +212,7 @@ def test_the_guides_layout_ends_where_there_is_no_room(folder):
 
 
 def test_a_preset_with_neighbours_to_draw_refuses_boids_in_one_line(folder, capsys):
-    Path("quick.toml").write_text(tomli_w.dumps({**TINY, "n_neighbours": [3, 9]}))
-    assert train(["--preset", "quick.toml", "--flock", "Reynolds", "--out", "runs/x"]) == 2
+    Path("hexapod.toml").write_text(tomli_w.dumps({**TINY, "n_neighbours": [3, 9]}))
+    assert train(["--preset", "hexapod.toml", "--flock", "Reynolds", "--out", "runs/x"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert "n_neighbours: Reynolds has none; give None" in line

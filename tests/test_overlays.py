@@ -12,7 +12,7 @@ from shepherd_phys.envs import ShepherdingEnv
 from shepherd_phys.envs.rewards import ANY, ORIGINAL, WILD, Occlusion, earning_beams
 from shepherd_phys.lidar import Lidar, Scan
 from shepherd_phys.obstacles import Pillar
-from shepherd_phys.overlays import Corner, Panel, hidden
+from shepherd_phys.overlays import Corner, Panel, Seen, extents, hidden
 from shepherd_phys.render import draw
 from shepherd_phys.scenario import Scenario
 from shepherd_phys.settings import Foreign
@@ -182,17 +182,52 @@ def test_the_panel_hides_nobody_who_can_be_spared(size, corner):
 def test_the_corner_is_kept_while_nothing_is_hidden():
     boxes = {"upper left": (10, 10, 100, 100), "upper right": (290, 10, 100, 100)}
     boxes |= {"lower left": (10, 290, 100, 100), "lower right": (290, 290, 100, 100)}
-    corner, one = Corner(), np.ones(1)
+
+    def points(at, weights=1.0, obstacles=()):
+        boxed = [extents(np.array(xy, dtype=float).reshape(-1, 2), np.zeros(len(xy))) for xy in (at, obstacles)]
+        return Seen(boxed[0], np.broadcast_to(weights, len(at)), boxed[1])
+
+    corner = Corner()
     walk = [(200, 200), (50, 50), (105, 50), (125, 50), (200, 50), (280, 50), (300, 50), (380, 50), (200, 50)]
-    names = [corner(boxes, np.array([at]), one) for at in walk]
+    names = [corner(boxes, points([at])) for at in walk]
     assert names == ["upper left"] + 5 * ["upper right"] + 3 * ["upper left"]
     everywhere = np.array([(x + dx, y) for x in (60, 340) for y in (60, 340) for dx in (-20, 0, 20)])
-    assert corner(boxes, everywhere, np.ones(12)) == "upper left"  # no other is better
-    assert corner(boxes, everywhere, np.where(everywhere[:, 0] > 300, 0.5, 1.0)) == "upper right"
+    assert corner(boxes, points(everywhere)) == "upper left"  # no other is better
+    assert corner(boxes, points(everywhere, np.where(everywhere[:, 0] > 300, 0.5, 1.0))) == "upper right"
     near = np.array([(50, 50), (120, 300), (280, 300)])  # beside both of the lower ones: the calm one is taken
-    assert Corner()(boxes, near, np.array([1.0, 1.0, 2.0])) == "upper right"
-    beside = ((10, 10, 20, 20), np.array([(35.0, 20.0)]), one)
-    assert hidden(*beside) == 0 and hidden(*beside, 4) == 0 and hidden(*beside, 6) == 1
+    assert Corner()(boxes, points(near, [1.0, 1.0, 2.0])) == "upper right"
+
+    rocks = [(50, 50), (350, 50), (60, 340)]  # better nothing than a rock, better many rocks than somebody
+    corner = Corner()
+    assert corner(boxes, points([(200, 200)], obstacles=rocks)) == "lower right"
+    assert corner(boxes, points([(300, 300)], obstacles=[*rocks, (60, 60), (350, 60)])) == "lower left"
+    assert corner(boxes, points([(200, 200)], obstacles=rocks)) == "lower left"  # nobody is hidden: it stays
+
+
+def test_what_is_hidden_in_part_is_hidden():
+    box, one = (10, 10, 20, 20), np.ones(1)
+    beside = np.array([(35.0, 20.0)])
+    assert [hidden(box, extents(beside, reach * one), one) for reach in (0, 4, 6)] == [0, 0, 1]
+    assert [hidden(box, extents(beside, 0 * one), one, around) for around in (0, 4, 6)] == [0, 0, 1]
+
+
+@pytest.mark.parametrize(
+    ("at", "vel"),
+    [((5.5, 3.7), (0, 0)), ((5.5, 3.7), (0.1, 0.1)), ((5.5, 3.0), (0, 1.5)), ((4.2, 8), (1.5, 0)), ((5.5, 8), (0, 0))],
+)
+@pytest.mark.parametrize("chosen", [None, 1])
+def test_the_panel_leaves_before_it_covers_any_part_of_a_shepherd(at, vel, chosen):
+    """One stands in the upper left, whence the panel stands upper right; the other comes under its edge."""
+    corner, options = Corner(), {"camera": CAMERA, "title": "collie\nseed 3", "rewards": {"a": 1.0, "b": 2.0, "c": 3.0}}
+    start = make([(0, 0)], [(-8, 8), (0, -3)], goal=(0, 0))
+    draw(start, (640, 640), panel=corner, **options)
+    assert corner.name == "upper right"
+    state = start.but(shepherd_pos=[(-8, 8), at], shepherd_vel=[(0, 0), vel])
+    told = draw(state, (640, 640), panel=corner, chosen=chosen, **options)
+    bare = draw(state, (640, 640), panel=False, chosen=chosen, **options)
+    assert corner.name == "lower left"
+    upper = slice(0, 320)
+    np.testing.assert_array_equal(told[upper], bare[upper])
 
 
 def test_small_pictures_tell_less_before_they_tell_nothing():

@@ -38,9 +38,9 @@ def shell(*words, status=0):
 def expected(trials):
     seeds = [trial_seed(20_000, trial) for trial in range(trials)]
     return {
-        file_name(point, point.settings_hash(), seed): (point.controller, seed)
+        file_name(point, point.settings_hash(), trial, seed): (point.controller, seed)
         for point in points(controllers=("strombom", "idle"), scenario="tiny.toml")
-        for seed in seeds
+        for trial, seed in enumerate(seeds)
     }
 
 
@@ -83,11 +83,11 @@ def test_names_are_fit_for_files_and_different(folder):
     one = points(controllers=("idle",), scenario="tiny.toml")[0]
     strange = type(one)("my.module:Own Chaser/../x", "weird/na me.toml", one.scenario)
     policy = type(one)("deep/er/policy.json", "tiny.toml", one.scenario)
-    names = [file_name(point, "ab" * 32, 5) for point in (one, strange, policy)]
-    names.append(file_name(one, "cd" * 32, 5))
-    names.append(file_name(one, "ab" * 32, 6))
+    names = [file_name(point, "ab" * 32, 0, 5) for point in (one, strange, policy)]
+    names.append(file_name(one, "cd" * 32, 0, 5))
+    names += [file_name(one, "ab" * 32, *of) for of in ((0, 6), (1, 5))]
     assert len(set(names)) == len(names)
     assert all(set(name) <= set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789._-") for name in names)
-    assert names[0] == "idle_tiny_2-flocks_n40_2-shepherds_6-sheep_abababab_seed-5.npz"
+    assert names[0] == "idle_tiny_2-flocks_n40_2-shepherds_6-sheep_abababab_trial-0_seed-5.npz"
     assert names[2].startswith("policy_tiny_")
-    assert len(file_name(type(one)("x" * 500, "y" * 500, one.scenario), "ab" * 32, 2**63 - 1)) < 250
+    assert len(file_name(type(one)("x" * 500, "y" * 500, one.scenario), "ab" * 32, 10**9, 2**63 - 1)) < 250

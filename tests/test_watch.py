@@ -26,7 +26,7 @@ from shepherd_phys.scripts import watch
 from shepherd_phys.scripts.main import main
 from shepherd_phys.scripts.player import Player
 from shepherd_phys.scripts.replay_page import page
-from shepherd_phys.scripts.sources import Recorded
+from shepherd_phys.scripts.sources import Recorded, shown_name
 from shepherd_phys.settings import SettingsError
 
 PROGRAM = str(Path(sys.executable).parent / "shepherd-phys")
@@ -312,6 +312,20 @@ def test_a_replay_is_a_source_of_the_states_that_were(kept):
     first = player.canvas().picture()
     player.tick(1.0)
     assert (player.canvas().picture() != first).any()
+
+
+@pytest.mark.parametrize(
+    ("controller", "name"),
+    [
+        ("collie", "collie"),
+        ("my.file:Own", "my.file:Own"),
+        ("best.json", "best"),
+        ("runs/obst/best.json", "obst/best"),
+        ("/best.json", "best"),
+    ],
+)
+def test_policies_of_different_runs_have_different_titles(controller, name):
+    assert shown_name(controller) == name
 
 
 def test_films_and_pages_of_a_replay(kept, tmp_path):
