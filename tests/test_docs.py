@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from shepherd_phys.layouts import Scattered
 from shepherd_phys.learning.preset import load_preset
+from shepherd_phys.scenario import Scenario, load_scenario
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -62,7 +64,7 @@ def test_links_between_pages_lead_somewhere():
 
 @pytest.mark.parametrize("page", ["first-steps.md", "training.md", "extending.md"])
 def test_presets_that_are_shown_are_such(page, tmp_path):
-    (shown,) = blocks(ROOT / "docs" / page, "toml")
+    shown = blocks(ROOT / "docs" / page, "toml")[-1]
     (tmp_path / "shown.toml").write_text(shown, encoding="utf-8")
     preset = load_preset(tmp_path / "shown.toml")
     again = tmp_path / "whole.toml"
@@ -70,3 +72,9 @@ def test_presets_that_are_shown_are_such(page, tmp_path):
     assert load_preset(again) == preset
     for name in re.findall(r"^\[?(\w+)", shown, re.MULTILINE):
         assert name in again.read_text(encoding="utf-8")
+
+
+def test_the_scenario_that_training_shows_is_one(tmp_path):
+    discs, _ = blocks(ROOT / "docs/training.md", "toml")
+    (tmp_path / "discs.toml").write_text(discs, encoding="utf-8")
+    assert load_scenario(tmp_path / "discs.toml") == Scenario(layout=Scattered(count=12))

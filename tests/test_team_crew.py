@@ -65,6 +65,15 @@ def test_a_worker_that_cannot_start_says_why():
         TeamVecEnv(SMALL, (1,), rewards={"odd": (1.0, Unreadable())}, n_workers=1)
 
 
+@pytest.fixture
+def ctrl_c():
+    """Python's own answer to SIGINT, which whoever started the tests in the background may have switched off."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("ctrl_c")
 def test_ctrl_c_breaks_a_step_off_and_a_reset_goes_on():
     env = TeamVecEnv(SMALL, (1, 1), rewards={"slow": (1.0, Slow(0.5))}, decision_interval=3, n_workers=2)
     try:
