@@ -13,6 +13,7 @@ import pymunk
 from shepherd_phys.bodies import SHEEP, Body, Disc, built
 from shepherd_phys.geometry import surfaces
 from shepherd_phys.obstacles import MIN_THICKNESS, Box, Fence, Obstacle, Pillar, Polygon, Wall, outline
+from shepherd_phys.outlines import edge
 from shepherd_phys.scenario import Scenario
 from shepherd_phys.state import Floats, WorldState
 from shepherd_phys.world import World
@@ -190,10 +191,7 @@ def _way_round(shape: pymunk.Shape, start: Floats, end: Floats) -> float:
     """The shortest way from start to end (2,) round a convex shape that lies between them [m]."""
     drawn = outline(shape)
     assert drawn is not None  # the kinds above are all of discs, segments and polygons
-    turns = np.linspace(0.0, 2 * np.pi, 32, endpoint=False)
-    ring = drawn.radius * np.stack([np.cos(turns), np.sin(turns)], axis=1)
-    points = np.concatenate([(drawn.points[:, None] + ring).reshape(-1, 2), start[None], end[None]])
-    hull = np.array(pymunk.Poly(None, points.tolist()).get_vertices())  # which takes the convex hull, in order
+    hull = edge(drawn, 32, start, end)
     first, last = sorted(int(np.hypot(*(hull - place).T).argmin()) for place in (start, end))
     sides = np.hypot(*(np.roll(hull, -1, axis=0) - hull).T)
     one = float(sides[first:last].sum())

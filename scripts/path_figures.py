@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
-import pymunk
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
@@ -16,6 +15,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon
 
 from shepherd_phys.obstacles import Obstacle, outlines
+from shepherd_phys.outlines import edge
 from shepherd_phys.placement import flock_of
 from shepherd_phys.render import THEMES
 from shepherd_phys.state import Floats
@@ -29,7 +29,8 @@ LOOK = THEMES["light"]
 FLOCKS = (ORANGE, SKY, GREEN, PURPLE, GREY, BLUE)
 TIME = LinearSegmentedColormap.from_list("time", ["#F6D98B", "#F0A24B", "#8FBF9F", "#3A9AB0", "#1D5C7A"])
 """Of the sheep: warm while the episode is young, cold when it is old; lighter than any shepherd."""
-ROUND = [(math.cos(a), math.sin(a)) for a in np.linspace(0.0, 2.0 * math.pi, 36, endpoint=False)]
+ARC = 36
+"""Corners of a full turn of what is round."""
 PIECES = 60
 """Of a sheep's path, each of one colour."""
 DECADES = 1e5
@@ -147,11 +148,7 @@ def draw_maps(found: Sequence[Map], who: Who, frame: Frame, about: str, goal_rad
 
 def corners(obstacles: Sequence[Obstacle]) -> list[Floats]:
     """Corners (K, 2) [m] of every shape of the obstacles, round ones as polygons."""
-    found = []
-    for shape in (shape for index, one in enumerate(obstacles) for shape in outlines(one, index)):
-        grown = [(x + shape.radius * c, y + shape.radius * s) for x, y in shape.points.tolist() for c, s in ROUND]
-        found.append(np.array(pymunk.Poly(None, grown).get_vertices()))  # which takes their convex hull
-    return found
+    return [edge(shape, ARC) for index, one in enumerate(obstacles) for shape in outlines(one, index)]
 
 
 def _ground(axes: Axes, goal: Floats, radius: float, stones: Sequence[Floats]) -> None:

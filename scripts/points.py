@@ -215,19 +215,20 @@ def strangers(points: Iterable[Point]) -> list[str]:
     """
     lines: dict[str, str] = {}
     usual = SCENARIOS[SCENARIO]
+    points = [point for point in points if point.controller.endswith(".json")]
+    learned_in = {path: load_policy(path).spec.scenario for path in {point.controller for point in points}}
     for point in points:
-        if point.controller.endswith(".json") and point.controller not in lines:
-            trained = load_policy(point.controller).spec.scenario
-            told = [
-                _told(trained, name)
-                for name in SEEN
-                if _seen(trained, name) != _seen(point.scenario, name) == _seen(usual, name)
-            ]
-            if told:
-                lines[point.controller] = (
-                    f"{Path(point.controller).name} was trained in another scenario ({', '.join(told)}); this is "
-                    f"{point.scenario_name}: --scenario names another"
-                )
+        trained = learned_in[point.controller]
+        told = [
+            _told(trained, name)
+            for name in SEEN
+            if _seen(trained, name) != _seen(point.scenario, name) == _seen(usual, name)
+        ]
+        if told and point.controller not in lines:
+            lines[point.controller] = (
+                f"{Path(point.controller).name} was trained in another scenario ({', '.join(told)}); this is "
+                f"{point.scenario_name}: --scenario names another"
+            )
     return list(lines.values())
 
 

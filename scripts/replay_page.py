@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from shepherd_phys.files import whole_file
-from shepherd_phys.obstacles import Outline, outlines
+from shepherd_phys.obstacles import outlines
+from shepherd_phys.outlines import edge
 from shepherd_phys.render import THEMES
 from shepherd_phys.replay import Replay, ReplayError, detection_radius
 from shepherd_phys.state import Floats, unit
@@ -33,8 +34,6 @@ LEVELS = 65_535
 """Whole numbers across the field."""
 TURNS = 255
 """Directions in a full turn, for the dots in front of agents."""
-ARC_POINTS = 24
-"""Corners of a drawn circle."""
 
 
 def write_page(replay: Replay, path: str | Path) -> None:
@@ -263,33 +262,6 @@ def _world(replay: Replay, field: tuple[float, float, float]) -> Any:
         ),
     )
     return plot
-
-
-def edge(outline: Outline) -> Any:
-    """Corners (K, 2) round what lies within an outline's radius of its points [m]."""
-    points = outline.points
-    if not outline.radius:
-        return points
-    turns = np.linspace(0, 2 * np.pi, ARC_POINTS, endpoint=False)
-    ring = outline.radius * np.stack([np.cos(turns), np.sin(turns)], axis=1)
-    return hull((points[:, None] + ring[None]).reshape(-1, 2))
-
-
-def hull(points: Any) -> Any:
-    """The convex hull (K, 2) of points, counter-clockwise (Andrew's monotone chain)."""
-    ordered = sorted({(float(x), float(y)) for x, y in points})
-    halves = []
-    for run in (ordered, ordered[::-1]):
-        half: list[tuple[float, float]] = []
-        for x, y in run:
-            while len(half) > 1:
-                (ax, ay), (bx, by) = half[-2:]
-                if (bx - ax) * (y - ay) - (by - ay) * (x - ax) > 0:
-                    break
-                half.pop()
-            half.append((x, y))
-        halves += half[:-1]
-    return np.array(halves)
 
 
 def _rewards(replay: Replay) -> Any:

@@ -8,8 +8,11 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import Any
 
+import numpy as np
+import pymunk
+
 from shepherd_phys.bodies import Body
-from shepherd_phys.obstacles import Obstacle, outline, outlines
+from shepherd_phys.obstacles import Obstacle, Outline, outline, outlines
 from shepherd_phys.settings import Foreign
 from shepherd_phys.state import Floats
 
@@ -48,3 +51,18 @@ def of_body(body: Same) -> list[Hull]:
     drawn = [one for one in map(outline, own.build()[1]) if one is not None]
     is_disc = len(drawn) == 1 and len(drawn[0].points) == 1 and not drawn[0].points.any()
     return [] if is_disc else [(one.points, one.radius) for one in drawn]
+
+
+def edge(drawn: Outline, arc: int = 24, *beside: Floats) -> Floats:
+    """Corners (K, 2) of an outline as one polygon, counter-clockwise [m].
+
+    Args:
+        drawn: the outline.
+        arc: corners of a full turn of what is round.
+        beside: further points (2,) [m] that the polygon has to hold.
+    """
+    turns = np.linspace(0.0, 2 * np.pi, arc, endpoint=False)
+    ring = drawn.radius * np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    grown = (drawn.points[:, None] + ring).reshape(-1, 2) if drawn.radius else drawn.points
+    points = [*grown.tolist(), *(point.tolist() for point in beside)]
+    return np.array(pymunk.Poly(None, points).get_vertices())  # which takes their convex hull, in order

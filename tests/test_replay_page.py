@@ -15,9 +15,10 @@ from shepherd_phys.controllers.recording import recorded
 from shepherd_phys.envs import ShepherdingEnv
 from shepherd_phys.flock import Strombom
 from shepherd_phys.obstacles import Box, Fence, Pillar, outlines
+from shepherd_phys.outlines import edge
 from shepherd_phys.replay import ReplayError
 from shepherd_phys.scenario import SCENARIOS, Scenario
-from shepherd_phys.scripts.replay_page import LEVELS, edge, page, write_page
+from shepherd_phys.scripts.replay_page import LEVELS, page, write_page
 from shepherd_phys.state import unit
 
 pytest.importorskip("bokeh", reason="NO PAGE WAS MADE: bokeh is missing")
