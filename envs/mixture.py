@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any
 
 import numpy as np
@@ -35,6 +36,9 @@ class Mixture(Settings):
     """Least and most neighbours n to whom a sheep is drawn, the paper's cohesion; None: as in the base, whose flock
     model need not have an ``n_neighbours``."""
 
+    n_sheep: Annotated[tuple[Count, Count], BeforeValidator(_ordered)] | None = None
+    """Least and most sheep, drawn with their logarithm uniform; the goal's area grows and shrinks with their number.
+    None: as in the base."""
     others: tuple[Scenario, ...] = ()
     """Each episode's base is the base or one of these, all with the same probability."""
     density: Annotated[tuple[Fraction, Fraction], BeforeValidator(_ordered)] | None = None
@@ -45,8 +49,9 @@ class Mixture(Settings):
 
     def __post_init__(self) -> None:
         for base in self.bases:
-            if self.n_flocks[1] > base.n_sheep:
-                raise ValueError(f"n_flocks may be {self.n_flocks[1]}, more than there are sheep ({base.n_sheep})")
+            fewest = base.n_sheep if self.n_sheep is None else self.n_sheep[0]
+            if self.n_flocks[1] > fewest:
+                raise ValueError(f"n_flocks may be {self.n_flocks[1]}, more than there are sheep ({fewest})")
             if base.flock_sizes is not None:
                 raise ValueError(f"base.flock_sizes: a mixture draws its own (given: {base.flock_sizes})")
             if self.n_neighbours is not None and not hasattr(base.flock, "n_neighbours"):
@@ -68,6 +73,9 @@ class Mixture(Settings):
         """The scenario of the next episode; the world's index plays no part."""
         n_flocks = int(rng.integers(*self.n_flocks, endpoint=True))
         base = self.bases[int(rng.integers(len(self.bases)))] if self.others else self.base
+        if self.n_sheep is not None:
+            n_sheep = _between(rng, *self.n_sheep)
+            base = base.but(n_sheep=n_sheep, goal_radius=base.goal_radius * math.sqrt(n_sheep / base.n_sheep))
         flock, layout = base.flock, base.layout
         if self.n_neighbours is not None:
             flock = flock.but(n_neighbours=int(rng.integers(*self.n_neighbours, endpoint=True)))
@@ -78,3 +86,9 @@ class Mixture(Settings):
             others = rng.multinomial(base.n_sheep - n_flocks, rng.dirichlet(np.ones(n_flocks)))
             sizes = tuple(int(1 + more) for more in others)
         return base.but(n_flocks=n_flocks, flock=flock, flock_sizes=sizes, layout=layout)
+
+
+def _between(rng: np.random.Generator, least: int, most: int) -> int:
+    """A number of either end or between; twice as many are as likely as half as many."""
+    drawn = math.exp(rng.uniform(math.log(least), math.log(most)))
+    return min(max(round(drawn), least), most)

@@ -376,6 +376,8 @@ def test_a_preset_may_mix_worlds_and_price_effort():
     far = TINY.but(flock_distance=(4.0, 5.0), uneven=1.0).draw()(np.random.default_rng(0), 0)
     assert far.flock_distance == (4.0, 5.0) and far.flock_sizes is not None and far.n_flocks == TINY.scenario.n_flocks
     assert TINY.but(flock_distance=(4.0, 5.0)).draw() == TINY.scenario.but(flock_distance=(4.0, 5.0))
+    most = TINY.but(n_sheep=(TINY.scenario.n_sheep, TINY.scenario.n_sheep + 9)).draw()
+    assert {most(np.random.default_rng(k), 0).n_sheep - TINY.scenario.n_sheep for k in range(200)} == set(range(10))
     assert TINY.draw() == TINY.scenario
 
 

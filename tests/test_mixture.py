@@ -44,6 +44,22 @@ def test_flocks_of_a_mixture_may_differ_in_size():
     assert all(s.flock_sizes is None for s in (mixture.but(uneven=0.0)(np.random.default_rng(k), 0) for k in range(20)))
 
 
+def test_a_mixture_gives_each_sheep_of_a_larger_herd_as_much_of_the_goal():
+    mixture = Mixture(base=SMALL, n_flocks=(1, 3), n_neighbours=None, n_sheep=(5, 20), uneven=0.5)
+    rng = np.random.default_rng(0)
+    drawn = [mixture(rng, 0) for _ in range(400)]
+    assert {s.n_sheep for s in drawn} == set(range(5, 21))
+    rooms = [s.goal_radius**2 / s.n_sheep for s in drawn]
+    assert rooms == pytest.approx([SMALL.goal_radius**2 / SMALL.n_sheep] * 400)
+    # 5 to 10 is as likely as 10 to 20, but that what lies between 9.5 and 10 is rounded up
+    assert 150 < sum(s.n_sheep < 10 for s in drawn) < 220
+    assert all(sum(s.flock_sizes) == s.n_sheep for s in drawn if s.flock_sizes is not None)
+    assert World(drawn[0]).reset(0).n_sheep == drawn[0].n_sheep
+    assert mixture.but(n_sheep=(7, 7))(rng, 0).n_sheep == 7
+    with pytest.raises(SettingsError, match=r"n_flocks may be 3, more than there are sheep \(2\)"):
+        mixture.but(n_sheep=(2, 9))
+
+
 def test_a_mixture_draws_among_scenarios_and_densities():
     mixture = Mixture(
         base=SCENARIOS["scattered"],

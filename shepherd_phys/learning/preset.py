@@ -173,6 +173,9 @@ class Preset(Settings):
     """Least and most flocks, drawn anew for every episode; none: the scenario's."""
     n_neighbours: Range | None = None
     """Least and most neighbours n, drawn anew for every episode; none: the scenario's."""
+    n_sheep: Range | None = None
+    """Least and most sheep, drawn anew for every episode while learning, with their logarithm uniform, so that twice as
+    many are as likely as half as many; the goal's area grows and shrinks with their number. None: the scenario's."""
     flock_distance: Span | None = None
     """Least and largest distance of a flock's centre from the goal's while learning [m]; none: the scenario's."""
     uneven: float = Field(default=0.0, ge=0, le=1)
@@ -246,6 +249,7 @@ class Preset(Settings):
             raise ValueError(f"lidar: {frames} numbers of frames to remember; a policy may have {MAX_FRAMES}")
         bounds = {
             "worlds, scenario.n_sheep": (self.worlds * self.scenario.n_sheep, "sheep", MOST_SHEEP),
+            "worlds, n_sheep": (self.worlds * max(self.n_sheep or (0,)), "sheep", MOST_SHEEP),
             "worlds, team_sizes, lidar": (self.n_slots * frames, "numbers of frames to remember", MOST_FRAMES),
             "worlds, team_sizes, ppo.n_steps, lidar": (
                 self.n_slots * self.ppo.n_steps * math.prod(input_shape(lidar)),
@@ -294,12 +298,14 @@ class Preset(Settings):
     def draw(self) -> Scenario | Mixture:
         """The scenario, or what draws one for each episode."""
         base = self.scenario.but(flock_distance=self.flock_distance) if self.flock_distance else self.scenario
-        if not (self.n_flocks or self.n_neighbours or self.uneven or self.scenarios or self.density):
+        drawn = (self.n_flocks, self.n_neighbours, self.n_sheep, self.uneven, self.scenarios, self.density)
+        if not any(drawn):
             return base
         return Mixture(
             base=base,
             n_flocks=self.n_flocks or (base.n_flocks, base.n_flocks),
             n_neighbours=self.n_neighbours,
+            n_sheep=self.n_sheep,
             others=tuple(SCENARIOS[name] for name in self.scenarios),
             density=self.density,
             uneven=self.uneven,
