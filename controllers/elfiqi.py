@@ -34,7 +34,7 @@ from pydantic import Field
 from shepherd_phys.settings import Settings, settings
 from shepherd_phys.state import Floats, WorldState, centroid, unit
 
-from .formation import SubFlocks, Surroundings, Team, TeamSettings
+from .formation import SubFlocks, Team, TeamSettings
 from .places import bearing_of, heading, in_order, limited, wrapped
 
 MU = 2.0
@@ -126,7 +126,6 @@ class ElfiqiLiteral:
 
     def __init__(self, settings: ElfiqiRadii | None = None) -> None:
         self.settings = settings or ElfiqiRadii()
-        self._surroundings = Surroundings()
 
     def reset(self, rng: np.random.Generator) -> None:
         """Take the episode's generator."""
@@ -143,7 +142,7 @@ class ElfiqiLiteral:
         jitter = self._rng.uniform(-JITTER, JITTER, pos.shape)
         force = unit(targets - pos) + SHEPHERD_WEIGHT * shepherd_repulsion(pos) + JITTER_WEIGHT * jitter
         if state.obstacles:
-            distance, away = self._surroundings.of(state.obstacles).static_distances(pos)
+            distance, away = state.surroundings.static_distances(pos)
             size = np.where(distance < OBSTACLE_RANGE, np.exp(-MU * np.maximum(distance, 0.0) / OBSTACLE_RANGE), 0.0)
             force = force + OBSTACLE_WEIGHT * (size[:, :, None] * away).sum(axis=1)
         step = (state.shepherd_max_speed * state.control_dt)[:, None]

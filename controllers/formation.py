@@ -16,18 +16,19 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-import pymunk
 from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
-from shepherd_phys.geometry import OBSTACLES, Geometry, compile_shapes
-from shepherd_phys.obstacles import Obstacle, solid
+from shepherd_phys.geometry import Geometry
 from shepherd_phys.settings import Settings, settings
 from shepherd_phys.state import Floats, WorldState, sub_flocks
 
 from .places import beyond, leak_places, make_way, ring_places, round_about, walk
 from .routes import Routes
+
+SLACK = 0.05
+"""What a shepherd leaves between itself and an obstacle at least [m]."""
 
 
 @settings
@@ -57,7 +58,7 @@ class TeamSettings(Settings):
     berth: float = Field(default=9.0, ge=0)
     """Nearer than this to a flock's centroid no shepherd passes on its way to the other side."""
     clearance: float = Field(default=0.5, gt=0)
-    """A shepherd's centre keeps this far from obstacles; more than its radius."""
+    """A shepherd's centre keeps this far from obstacles, a larger one its radius and `SLACK`."""
     flock_clearance: float = Field(default=1.5, gt=0)
     """A flock is led round obstacles so that its centroid keeps this far from them, where there is such a way."""
 
@@ -73,7 +74,6 @@ class Team:
 
     def __init__(self, settings: TeamSettings) -> None:
         self._common = settings
-        self._surroundings = Surroundings()
         self._routes: tuple[Geometry, Routes, Routes] | None = None  # round which obstacles: shepherds', flocks'
 
     def reset(self, rng: np.random.Generator) -> None:
@@ -89,9 +89,10 @@ class Team:
         """(P, 2)."""
         s = self._common
         if state.obstacles:
-            geometry = self._surroundings.of(state.obstacles)
+            geometry = state.surroundings
             if self._routes is None or self._routes[0] is not geometry:
-                self._routes = geometry, Routes(geometry, s.clearance), Routes(geometry, s.flock_clearance)
+                clearance = max(s.clearance, float(state.shepherd_radius.max(initial=0.0)) + SLACK)
+                self._routes = geometry, Routes(geometry, clearance), Routes(geometry, s.flock_clearance)
         targets, stop = self._wanted(state)
         if state.obstacles and self._routes is not None:
             targets = self._aside(state.shepherd_pos, self._routes[1].towards(state.shepherd_pos, targets))
@@ -160,23 +161,6 @@ class Team:
     def _way(self, state: WorldState, targets: Floats, flocks: SubFlocks) -> Floats:
         """(P, 2) the next places to walk to: round the sub-flock at work."""
         return np.asarray(round_about(state.shepherd_pos, targets, flocks.centers[0], self._common.berth))
-
-
-class Surroundings:
-    """The obstacles of an episode as surfaces, compiled once."""
-
-    def __init__(self) -> None:
-        self._obstacles: tuple[Obstacle, ...] = ()
-        self._geometry = compile_shapes(())
-
-    def of(self, obstacles: tuple[Obstacle, ...]) -> Geometry:
-        """Their surfaces."""
-        if obstacles is not self._obstacles:
-            body = pymunk.Body(body_type=pymunk.Body.STATIC)
-            shapes = [shape for i, obstacle in enumerate(obstacles) for shape in solid(obstacle, i, body)]
-            self._geometry = compile_shapes((shape, -1, OBSTACLES) for shape in shapes)
-            self._obstacles = obstacles
-        return self._geometry
 
 
 class SubFlocks(NamedTuple):

@@ -23,8 +23,8 @@ from shepherd_phys.workers import explain
 from shepherd_phys.world import World
 
 
-def find_kinds(body: str | None, flock: str | None) -> dict[str, type[Any]]:
-    """The classes that ``--body`` and ``--flock`` name, where they are given.
+def find_kinds(body: str | None, flock: str | None) -> dict[str, Any]:
+    """The classes that ``--body`` and ``--flock`` name, where they are given; a flock model may be a function.
 
     Raises:
         SettingsError: there is none of a name.
@@ -54,8 +54,8 @@ def find_scenario(name: str, classes: Iterable[type[Any]] = ()) -> Scenario:
     return own
 
 
-def of_kinds(base: Scenario, kinds: Mapping[str, type[Any]]) -> tuple[Scenario, Any]:
-    """A scenario with all shepherds' bodies, or its flock model, of the classes of `find_kinds`.
+def of_kinds(base: Scenario, kinds: Mapping[str, Any]) -> tuple[Scenario, Any]:
+    """A scenario with all shepherds' bodies, or its flock model, of the classes of `find_kinds`, or that function.
 
     What is of the class already stays; everything else becomes one made without arguments.
 
@@ -67,7 +67,9 @@ def of_kinds(base: Scenario, kinds: Mapping[str, type[Any]]) -> tuple[Scenario, 
     """
     default: Any = Disc()
     flock, body = kinds.get("flock"), kinds.get("body")
-    if flock is not None and type(base.flock) is not flock:
+    if inspect.isroutine(flock):
+        base = base.but(flock=flock)
+    elif flock is not None and type(base.flock) is not flock:
         base = base.but(flock=_made(flock, FlockModel, f"flock: {kind_of(flock)}"))
     if body is not None and (not base.shepherds or any(type(own) is not body for own in base.shepherds)):
         default = _made(body, Body, f"body: {kind_of(body)}")
@@ -140,8 +142,8 @@ def try_out(world: World, seeds: Sequence[int], scheme: Scheme | None = None, li
         raise SettingsError(explain(error)) from None
 
 
-def find_class(name: str, known: dict[str, type[Any]], where: str) -> type[Any]:
-    """A class by its name among ``known`` or by ``module:Name``.
+def find_class(name: str, known: dict[str, type[Any]], where: str) -> Any:
+    """A class by its name among ``known`` or by ``module:Name``; as a flock model a function, too.
 
     Raises:
         SettingsError: there is none.
@@ -154,8 +156,9 @@ def find_class(name: str, known: dict[str, type[Any]], where: str) -> type[Any]:
             )
         return known[name]
     own = imported(name, where)
-    if not inspect.isclass(own):
-        raise SettingsError(f"{where}: {name}: needs a class (it is a {type(own).__name__})")
+    if not (inspect.isclass(own) or (where == "flock" and inspect.isroutine(own))):
+        wanted = "a class or a function" if where == "flock" else "a class"
+        raise SettingsError(f"{where}: {name}: needs {wanted} (it is a {type(own).__name__})")
     return own
 
 

@@ -22,7 +22,7 @@ Ints = NDArray[np.int64]
 
 @runtime_checkable
 class FlockModel(Protocol):
-    """What the world needs of a flock model. A user adds one by writing a class with this method."""
+    """What the world needs of a flock model. A user writes a class with this method, or a function like it."""
 
     def velocities(self, state: WorldState, rng: np.random.Generator) -> Floats:
         """Desired velocities of all sheep, from one snapshot.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,6 +42,8 @@ __all__ = [
     "surface_distance",
     "surfaces",
 ]
+
+Floats = NDArray[np.float64]
 
 SHEEP_CATEGORY = 1
 SHEPHERD_CATEGORY = 2
@@ -114,6 +116,12 @@ class Geometry:
         rows = np.arange(len(pos))
         by = depth[rows, deepest]
         return np.asarray(pos + np.where(by > 0, by + CLEARANCE, 0.0)[:, None] * away[rows, deepest])
+
+    def clear_by(self, gap: float) -> Callable[[Floats, Floats], Floats] | None:
+        """`push_out` for discs that are to keep this far from what stands still [m]; None where nothing does."""
+        if not len(self.static) and not self.unknown:
+            return None
+        return lambda pos, radius: self.push_out(pos, radius + gap)
 
 
 def compile_shapes(shapes: Iterable[Owned]) -> Geometry:

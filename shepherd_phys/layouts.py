@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from functools import partial
 from typing import Annotated, Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -16,7 +15,7 @@ import pymunk
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field
 
-from shepherd_phys.geometry import CLEARANCE, Geometry, surfaces
+from shepherd_phys.geometry import CLEARANCE, surfaces
 from shepherd_phys.obstacles import MIN_THICKNESS, Box, Fence, Obstacle, Pillar, Point, Polygon, Wall, solid
 from shepherd_phys.placement import PlacementError, relax
 from shepherd_phys.settings import Settings, SettingsError, kind_of, settings
@@ -87,7 +86,8 @@ class Site:
         """Take an obstacle unless it is in the way; whether it was taken.
 
         It is refused if it comes nearer to the goal's border than ``goal_keep_out`` or to a body than
-        ``body_keep_out``, if it overlaps another obstacle, or if it could close off a pocket.
+        ``body_keep_out``, if it overlaps another obstacle, or if it could close off a pocket with others. What its own
+        shapes enclose is not looked at.
 
         Args:
             obstacle: what to take.
@@ -198,17 +198,12 @@ def laid_out(layout: Layout, rng: np.random.Generator, site: Site) -> tuple[tupl
                 "allowed (goal_keep_out)"
             )
         solids = (*site.fixed, *drawn)
-        clear = partial(_moved_clear, surfaces(solids), site.body_keep_out) if solids else None
         try:
-            return drawn, relax(site.body_pos, site.body_radius, push_out=clear)
+            return drawn, relax(site.body_pos, site.body_radius, push_out=surfaces(solids).clear_by(site.body_keep_out))
         except PlacementError:
             tries += 1
             if tries == DRAWS:
                 raise
-
-
-def _moved_clear(around: Geometry, keep_out: float, pos: Floats, radius: Floats) -> Floats:
-    return around.push_out(pos, radius + keep_out)
 
 
 Kind = Literal["Pillar", "Wall", "Box", "Polygon"]

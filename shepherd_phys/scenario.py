@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import numbers
 from collections.abc import Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field
 
 from shepherd_phys.avoidance import Avoidance
-from shepherd_phys.bodies import BODIES, SHEEP, Body, Disc
+from shepherd_phys.bodies import BODIES, SHEEP, Body, Disc, flies, mass_of
 from shepherd_phys.flock import FLOCKS, FlockModel, Strombom
 from shepherd_phys.imperfections import Imperfections
 from shepherd_phys.layouts import LAYOUTS, Corridor, Fenced, Lattice, Layout, Scattered
@@ -22,6 +24,7 @@ from shepherd_phys.settings import (
     Settings,
     SettingsError,
     handed_over,
+    kind_of,
     listed,
     meant,
     read_toml,
@@ -39,6 +42,10 @@ GOAL_KEEP_OUT, BODY_KEEP_OUT = 2.0, 0.5
 """[m]"""
 OBSTACLE_SUBSTEPS = 3
 """The same among obstacles: with two, a shepherd squeezes one sheep in a hundred through a thin wall (measured)."""
+PRESSED_SUBSTEPS = 5
+"""The same where a shepherd presses harder than the default one: heavier beside the sheep, or faster (measured)."""
+PRESSING = 5.0, 1.5
+"""The default shepherd's mass over the default sheep's [1], and its top speed [m/s]."""
 PRESET_FIELDS = frozenset({"scenario", "ppo", "reward", "budget"})
 """What a file of training settings holds and no scenario has: the two are easily mistaken."""
 
@@ -103,15 +110,15 @@ class Scenario(Settings):
     sheep: Annotated[Any, BeforeValidator(_sheep_kinds)] = SHEEP
     """The sheep's body; a tuple: several, which the sheep have in turn, the first sheep the first one."""
     flock: Any = Strombom()
-    """How sheep move: a flock model."""
+    """How sheep move: a flock model, or a function like its ``velocities``."""
     obstacles: tuple[Any, ...] = ()
     """Solid, static things, the same in every episode."""
     layout: Any = None
     """Draws further obstacles anew at each reset, from a random stream of its own: a `Layout`, or none."""
     goal_keep_out: float = Field(default=GOAL_KEEP_OUT, ge=0)
-    """Obstacles of a layout keep this far from the goal's border [m]."""
+    """Obstacles keep this far from the border of a goal that is drawn, those of a layout from any goal's [m]."""
     body_keep_out: float = Field(default=BODY_KEEP_OUT, ge=0)
-    """Where a layout draws, every body starts at least this far from any obstacle [m]."""
+    """Every body starts at least this far from any obstacle [m]."""
     imperfections: Imperfections | None = None
     """What goes wrong with the shepherds' sensors and drives; none given: nothing."""
     n_steps: int = Field(default=1000, ge=1)
@@ -119,7 +126,8 @@ class Scenario(Settings):
     control_dt: float = Field(default=0.2, gt=0)
     """Length of a control step [s]."""
     substeps: int | None = Field(default=None, ge=1)
-    """Engine steps in a control step; none given: `OPEN_SUBSTEPS`, or `OBSTACLE_SUBSTEPS` where there are obstacles."""
+    """Engine steps in a control step; none given: `OPEN_SUBSTEPS`, where there are obstacles `OBSTACLE_SUBSTEPS`, or
+    `PRESSED_SUBSTEPS` if a shepherd weighs more than five times a sheep or walks faster than 1.5 m/s."""
     iterations: int = Field(default=4, ge=1)
     """Iterations of the engine's contact solver in an engine step."""
     collision_slop: float = Field(default=0.005, ge=0)
@@ -174,7 +182,15 @@ class Scenario(Settings):
     @property
     def n_substeps(self) -> int:
         """Engine steps in a control step."""
-        return self.substeps or (OBSTACLE_SUBSTEPS if self.has_obstacles else OPEN_SUBSTEPS)
+        if self.substeps or not self.has_obstacles:
+            return self.substeps or OPEN_SUBSTEPS
+        lightest = min(mass_of(body, "sheep") for body in self.sheep_kinds)
+        pressing = (body for body in self.shepherds if not flies(body))
+        hard = any(
+            mass_of(body, f"shepherd {k}") > PRESSING[0] * lightest or body.max_speed > PRESSING[1]
+            for k, body in enumerate(pressing)
+        )
+        return PRESSED_SUBSTEPS if hard else OBSTACLE_SUBSTEPS
 
     @property
     def physics_dt(self) -> float:
@@ -286,4 +302,17 @@ def load_scenario(name_or_path: str | Path, classes: Iterable[Any] = ()) -> Scen
     )
 
 
-__all__ = ["SCENARIOS", "Body", "FlockModel", "Layout", "Obstacle", "Scenario", "load_scenario"]
+def with_neighbours(scenario: Scenario, n: int) -> Scenario:
+    """The scenario whose flock model, the library's or a user's own dataclass, has so many neighbours n.
+
+    Raises:
+        SettingsError: it has no ``n_neighbours``.
+    """
+    flock = scenario.flock
+    if not hasattr(flock, "n_neighbours"):
+        raise SettingsError(f"cohesion: the flock model {kind_of(flock)} has no n_neighbours to set (given: {n})")
+    changed = flock.but if hasattr(flock, "but") else partial(dataclasses.replace, flock)
+    return scenario.but(flock=changed(n_neighbours=n))
+
+
+__all__ = ["SCENARIOS", "Body", "FlockModel", "Layout", "Obstacle", "Scenario", "load_scenario", "with_neighbours"]

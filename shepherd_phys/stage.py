@@ -226,7 +226,7 @@ def _drawn(scenario: Scenario, streams: Streams, radius: Floats, ground: pymunk.
             f"obstacles: in {PLACE_TRIES} draws they left no room for the goal, a shepherd or a flock's centroid; "
             "fewer or smaller ones, a larger box or another goal_pos make some"
         )
-    pos = relax(np.concatenate([sheep_pos, shepherd_pos]), radius, push_out=solids.push_out if static else None)
+    pos = relax(np.concatenate([sheep_pos, shepherd_pos]), radius, push_out=solids.clear_by(scenario.body_keep_out))
     if scenario.layout is not None:
         site = Site(
             box=scenario.box,
@@ -256,7 +256,7 @@ def _has_room(scenario: Scenario, solids: Geometry, goal: Floats, sheep_pos: Flo
     points = np.concatenate([goal[None], shepherd_pos, centroids])
     wanted = np.zeros(len(points))
     if scenario.goal_pos is None:
-        wanted[0] = scenario.goal_radius
+        wanted[0] = scenario.goal_radius + scenario.goal_keep_out
     return bool((solids.static_distances(points)[0].min(axis=1) > wanted).all())
 
 

@@ -58,8 +58,9 @@ class World:
                 raise thing.missing()
             if isinstance(thing, type):
                 raise SettingsError(f"{kind_of(thing)}: a class was given; make one of it: {thing.__name__}()")
-        if not hasattr(scenario.flock, "velocities"):
-            raise SettingsError(f"flock ({kind_of(scenario.flock)}): a flock model needs 'velocities'")
+        self._velocities = getattr(scenario.flock, "velocities", scenario.flock)
+        if not callable(self._velocities):
+            raise SettingsError(f"flock ({kind_of(scenario.flock)}): needs 'velocities', or to be a function like it")
         self.scenario = scenario
         self._h, self._substeps = scenario.physics_dt, scenario.n_substeps
         self._n = scenario.n_sheep
@@ -194,8 +195,8 @@ class World:
         # before the flock draws its random numbers: a refused action must change nothing
         if not _motion.command_shepherds(action, self._speed, command):
             raise NonFiniteError("action: every number must be finite")
-        flock = type(scenario.flock).__name__
-        wanted = scenario.flock.velocities(state, self._noise)
+        flock = kind_of(scenario.flock)
+        wanted = self._velocities(state, self._noise)
         try:
             wanted = np.asarray(wanted, dtype=np.float64)
         except (TypeError, ValueError):

@@ -119,9 +119,28 @@ def test_a_policy_is_trained_in_a_scenario_of_a_users_own_classes_and_goes_on(fo
     sys.modules.pop("mine")
 
 
+def test_a_flock_model_of_a_users_own_may_be_a_function(folder, capsys):
+    Path("mine.py").write_text("def still(state, rng): return 0.0 * state.sheep_pos\nSTILL = 3\n")
+    words = "--controllers idle --scenario tiny.toml --trials 1 --workers 1 --flock mine:"
+    shell(f"evaluate {words}still")
+    assert [(row["cohesion"], row["ever_in_goal"]) for row in rows()] == [("", "0.0")]
+    assert evaluate([*f"{words}STILL".split(), "--out", "other"]) == 2
+    assert "flock: mine:STILL: needs a class or a function (it is a int)" in capsys.readouterr().err
+    sys.modules.pop("mine")
+
+
 def test_the_guides_preset_is_one(folder):
     preset = Preset.from_dict(QUICK)
     assert (preset.n_slots, preset.budget) == (48, 50_000)
+
+
+@pytest.mark.slow
+def test_the_guides_preset_trains_as_printed_and_what_it_made_plays(folder):
+    Path("quick.toml").write_text(blocks(PAGE, "toml")[0])
+    shell("train --preset quick.toml --body my_file:Hexapod --out runs/quick --workers 2")
+    assert load_policy("runs/quick/policy.json").spec.training["shepherd_steps"] >= 50_000
+    shell("evaluate --controllers runs/quick/best.json --body my_file:Hexapod --trials 2 --workers 2")
+    assert [row["n_shepherds"] for row in rows()] == ["3", "3"]
 
 
 BROKEN = """
@@ -211,8 +230,9 @@ def test_the_guides_layout_ends_where_there_is_no_room(folder):
     assert 4 < len(state.obstacles) < 200
 
 
-def test_a_preset_with_neighbours_to_draw_refuses_boids_in_one_line(folder, capsys):
-    Path("hexapod.toml").write_text(tomli_w.dumps({**TINY, "n_neighbours": [3, 9]}))
-    assert train(["--preset", "hexapod.toml", "--flock", "Reynolds", "--out", "runs/x"]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "n_neighbours: Reynolds has none; give None" in line
+def test_a_preset_with_neighbours_to_draw_draws_none_for_a_flock_model_without(folder):
+    Path("hexapod.toml").write_text(tomli_w.dumps({**TINY, "n_neighbours": [3, 9], "budget": 160}))
+    assert train(["--preset", "hexapod.toml", "--flock", "Reynolds", "--out", "runs/x", "--workers", "1"]) == 0
+    assert Preset.from_toml("runs/x/preset.toml").n_neighbours is None
+    with open("runs/x/validation.csv", newline="", encoding="utf-8") as file:
+        assert {row["cohesion"] for row in csv.DictReader(file)} == {""}

@@ -4,12 +4,14 @@ import numpy as np
 import pytest
 from scenes import NOTHING, arranged
 
+from shepherd_phys.bodies import BODIES, Disc, built
 from shepherd_phys.controllers import CONTROLLERS
-from shepherd_phys.controllers.formation import Surroundings, flocks_out
+from shepherd_phys.controllers.formation import SLACK, TeamSettings, flocks_out
 from shepherd_phys.controllers.places import beyond, in_order, leak_places, make_way
 from shepherd_phys.controllers.strombom import StrombomTeam
 from shepherd_phys.envs import ShepherdingEnv
-from shepherd_phys.obstacles import Pillar, Wall
+from shepherd_phys.geometry import surfaces
+from shepherd_phys.obstacles import Wall
 from shepherd_phys.scenario import Scenario
 from shepherd_phys.world import World
 
@@ -62,16 +64,6 @@ def test_targets_too_near_the_goal_move_straight_out():
     assert moved == pytest.approx(np.array([[6.0, 8.0], [12.0, 0.0]]))
 
 
-def test_surroundings_are_compiled_once_for_an_episode():
-    surroundings, obstacles = Surroundings(), (Pillar((5.0, 0.0), 1.0),)
-    geometry = surroundings.of(obstacles)
-    distance, away = geometry.static_distances(np.array([[0.0, 0.0]]))
-    assert distance.tolist() == [[4.0]]
-    assert away[0, 0].tolist() == [-1.0, 0.0]
-    assert surroundings.of(obstacles) is geometry
-    assert surroundings.of((Pillar((9.0, 0.0), 1.0),)) is not geometry
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("n_shepherds", [1, 2, 3, 6])
 @pytest.mark.parametrize("name", TUNED)
@@ -110,9 +102,30 @@ def test_every_tuned_team_walks_and_leads_its_flock_round_walls(name):
     state = world.reset_to(start, seed=1)
     controller = CONTROLLERS[name]()
     controller.reset(world.user_rng)
-    surfaces, nearest = Surroundings().of(WALLED), np.inf
+    around, nearest = surfaces(WALLED), np.inf
     for _ in range(700):
         state = world.step(controller.act(NOTHING, state))
-        nearest = min(nearest, surfaces.static_distances(state.shepherd_pos)[0].min())
+        nearest = min(nearest, around.static_distances(state.shepherd_pos)[0].min())
     assert state.sheep_in_goal.mean() >= 0.95
     assert nearest > 0.25  # the radius of a shepherd: none touched a wall
+
+
+@pytest.mark.parametrize(("radius", "through"), [(0.25, 0.0), (0.8, 7.5)])
+def test_a_shepherd_takes_a_gap_through_which_it_fits(radius, through):
+    fence = (Wall((0.0, -30.0), (0.0, -0.65)), Wall((0.0, 0.65), (0.0, 6.0)), Wall((0.0, 9.0), (0.0, 30.0)))
+    world = World(Scenario(n_sheep=1, n_flocks=1, shepherds=(Disc(radius=radius),), obstacles=fence))
+    drawn = world.reset(0)
+    state = world.reset_to(drawn.but(goal_pos=(-30.0, 0.0), sheep_pos=[(12.0, 0.0)], shepherd_pos=[(-5.0, 0.0)]), 1)
+    team = CONTROLLERS["strombom"]()
+    team.reset(world.user_rng)
+    for _ in range(200):
+        state = world.step(team.act(NOTHING, state))
+        if state.shepherd_pos[0, 0] > 0:
+            break
+    assert state.shepherd_pos[0] == pytest.approx([0.0, through], abs=1.0)
+    assert state.collisions == 0
+
+
+def test_no_body_of_the_library_needs_more_room_than_the_teams_leave():
+    for body in BODIES.values():
+        assert built(body(), "shepherd")[2] + SLACK <= TeamSettings().clearance

@@ -328,8 +328,14 @@ def test_both_engines_agree_in_drawn_worlds(scenario):
 
 
 def test_avoidance_can_be_turned_off_in_a_preset():
-    calm = SCENARIOS["fence"].but(flock=SCENARIOS["fence"].flock.but(avoidance=Avoidance(weight=0.0)))
-    World(calm).reset(0)
+    walled = Scenario(n_sheep=1, n_flocks=1, shepherds=1, obstacles=(Wall((5.0, -9.0), (5.0, 9.0)),))
+    ways = []
+    for weight in (1.5, 0.0):
+        world = World(walled.but(flock=walled.flock.but(avoidance=Avoidance(weight=weight), noise=0.0)))
+        start = world.reset(0).but(sheep_pos=[(4.5, 0.0)], shepherd_pos=[(4.5, -4.0)], sheep_heading=[(0.0, 1.0)])
+        world.reset_to(start, seed=0)
+        ways.append(world.step(np.zeros((1, 2))).sheep_vel[0])
+    assert ways[0][0] < -0.1 and ways[1].tolist() == pytest.approx([0.0, 1.0])  # who feels no wall runs along it
 
 
 def test_a_policy_that_knows_three_channels_runs_among_obstacles(tmp_path):

@@ -7,10 +7,10 @@ import pytest
 from scenes import NOTHING, arranged, one_flock
 
 from shepherd_phys.controllers import Occlusion
-from shepherd_phys.controllers.formation import Surroundings
 from shepherd_phys.controllers.occlusion import occlusion_targets, shared_out, traded
 from shepherd_phys.controllers.places import WEDGE
 from shepherd_phys.controllers.routes import Routes
+from shepherd_phys.geometry import surfaces
 from shepherd_phys.obstacles import Pillar, Wall
 
 
@@ -82,7 +82,7 @@ def test_a_wall_across_its_circle_does_not_send_it_back_and_forth():
         state = arranged(sheep, [[8.0, 12.0]]).but(obstacles=(wall,))
         way = walks(state)[:, 0]
         assert way[-1, 0] > 24 and abs(way[-1, 1]) < 3
-        assert Surroundings().of((wall,)).static_distances(way)[0].min() > 0.25
+        assert surfaces((wall,)).static_distances(way)[0].min() > 0.25
 
 
 def test_behind_a_flock_means_on_its_side_of_a_wall():
@@ -109,10 +109,10 @@ def test_nobody_steps_aside_into_a_wall():
 
 def test_places_round_the_goal_are_traded_where_one_stands_in_the_others_way():
     pos, places = np.array([[0.0, 0.0], [1.0, 0.1]]), np.array([[8.0, 0.0], [1.0, 0.0]])
-    free = Routes(Surroundings().of((Pillar((0.0, 20.0), 1.0),)), 0.5)
+    free = Routes(surfaces((Pillar((0.0, 20.0), 1.0),)), 0.5)
     assert traded(free, pos, places).tolist() == [[1.0, 0.0], [8.0, 0.0]]
     assert traded(free, pos, places[::-1]).tolist() == [[1.0, 0.0], [8.0, 0.0]]
     # as the crow flies each would be nearer to the other's, across a long wall
-    walled = Routes(Surroundings().of((Wall((0.5, -30.0), (0.5, 30.0)),)), 0.5)
+    walled = Routes(surfaces((Wall((0.5, -30.0), (0.5, 30.0)),)), 0.5)
     pos, places = np.array([[-1.0, 0.0], [2.0, -8.0]]), np.array([[-1.0, -8.0], [2.0, 0.0]])
     assert traded(walled, pos, places).tolist() == places.tolist()

@@ -7,15 +7,15 @@ import pymunk
 import pytest
 from scipy.sparse.csgraph import dijkstra
 
-from shepherd_phys.controllers.formation import Surroundings
 from shepherd_phys.controllers.routes import Routes
+from shepherd_phys.geometry import surfaces
 from shepherd_phys.obstacles import Pillar, Polygon, Wall
 
 CLEARANCE = 0.5
 
 
 def routes(*obstacles, clearance=CLEARANCE):
-    return Routes(Surroundings().of(obstacles), clearance)
+    return Routes(surfaces(obstacles), clearance)
 
 
 def way(plan, start, target):
@@ -146,7 +146,7 @@ def least_distance(geometry, a, b, n=400):
 @pytest.mark.parametrize("seed", range(12))
 def test_the_shortest_of_all_ways_and_clear_all_along(seed):
     rng = np.random.default_rng(seed)
-    geometry = Surroundings().of(tuple(scene(rng)))
+    geometry = surfaces(tuple(scene(rng)))
     plan = Routes(geometry, CLEARANCE)
     ends = [p for p in rng.uniform(-12, 12, (40, 2)) if geometry.static_distances(p[None])[0].min() > CLEARANCE][:2]
     # the naive search: all ways between all nodes, looked at in small steps

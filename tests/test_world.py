@@ -11,7 +11,7 @@ import pymunk
 import pytest
 from pymunk import batch
 
-from shepherd_phys.bodies import Disc
+from shepherd_phys.bodies import SHEEP, DifferentialDrive, Disc, Flyer
 from shepherd_phys.flock import Strombom
 from shepherd_phys.obstacles import Pillar, Polygon, Wall
 from shepherd_phys.scenario import SCENARIOS, Scenario
@@ -335,7 +335,9 @@ def test_obstacles_that_cover_the_box_are_one_clear_error():
 
 def test_no_body_is_left_in_an_obstacle_and_no_room_is_an_error():
     wedge = (Wall((-50, -0.2), (50, -0.2)), Wall((-50, 0.2), (50, 0.2)))  # 0.3 m between them, a shepherd needs 0.5
-    scenario = Scenario(n_sheep=1, n_flocks=1, shepherds=1, goal_pos=(0.0, 30.0), box=0.1, obstacles=wedge)
+    scenario = Scenario(
+        n_sheep=1, n_flocks=1, shepherds=1, goal_pos=(0.0, 30.0), box=0.1, obstacles=wedge, body_keep_out=0.0
+    )
     with pytest.raises(SettingsError, match="1 of 2 bodies still overlap another or an obstacle|left no room"):
         World(scenario).reset(0)
     corners = tuple(
@@ -344,7 +346,8 @@ def test_no_body_is_left_in_an_obstacle_and_no_room_is_an_error():
         for y in range(-24, 25, 4)
         for wall in (Wall((x, y), (x + 0.8, y)), Wall((x, y), (x, y + 0.8)))
     )
-    world = World(Scenario(n_sheep=60, n_flocks=2, goal_radius=1.0, obstacles=corners))
+    crowded = Scenario(n_sheep=60, n_flocks=2, goal_radius=1.0, obstacles=corners, goal_keep_out=0.0, body_keep_out=0.0)
+    world = World(crowded)
     for seed in range(6):
         state = world.reset(seed)
         place = np.concatenate([state.sheep_pos, state.shepherd_pos])
@@ -355,6 +358,54 @@ def test_no_body_is_left_in_an_obstacle_and_no_room_is_an_error():
             for p, r in zip(place, radius, strict=True)
         ]
         assert min(gaps) >= 0.0
+
+
+def test_bodies_and_a_drawn_goal_keep_out_of_the_way_of_fixed_obstacles():
+    pillars = tuple(Pillar((x, y), 0.6) for x in range(-24, 25, 8) for y in range(-24, 25, 8))
+    for keep_out in (0.5, 0.2):
+        world = World(
+            Scenario(n_sheep=30, obstacles=pillars, goal_radius=1.5, goal_keep_out=1.0, body_keep_out=keep_out)
+        )
+        for seed in range(5):
+            state = world.reset(seed)
+            gaps = state.surroundings.static_distances(np.concatenate([state.sheep_pos, state.shepherd_pos]))[0].min(
+                axis=1
+            )
+            assert (gaps >= np.concatenate([state.sheep_radius, state.shepherd_radius]) + keep_out).all()
+            assert state.surroundings.static_distances(state.goal_pos[None])[0].min() >= 1.5 + 1.0
+    near = Scenario(n_sheep=5, n_flocks=1, obstacles=(Pillar((3.0, 0.0), 1.0),), goal_pos=(0.0, 0.0), goal_radius=2.0)
+    assert World(near).reset(0).goal_pos.tolist() == [0.0, 0.0]  # who places the goal knows best
+
+
+@pytest.mark.parametrize(
+    ("shepherds", "sheep", "substeps"),
+    [
+        ((Disc(mass=5.0),), SHEEP, 3),
+        ((Disc(mass=5.0), Disc(mass=5.1)), SHEEP, 5),
+        ((DifferentialDrive(max_speed=1.6),), SHEEP, 5),
+        ((Disc(mass=5.0),), (SHEEP, Disc(radius=0.12, mass=0.6, max_speed=0.8)), 5),
+        ((Flyer(mass=50.0, max_speed=9.0),), SHEEP, 3),
+    ],
+)
+def test_shepherds_that_press_hard_take_more_engine_steps_among_obstacles(shepherds, sheep, substeps):
+    walled = Scenario(shepherds=shepherds, sheep=sheep, obstacles=(Wall((0.0, 0.0), (1.0, 0.0)),))
+    assert walled.n_substeps == substeps and walled.physics_dt == pytest.approx(0.2 / substeps)
+    assert walled.but(obstacles=()).n_substeps == 2 and walled.but(substeps=4).n_substeps == 4
+
+
+def drift(state, rng):
+    """A flock model as a function: everybody goes east."""
+    return np.tile([0.7, 0.0], (state.n_sheep, 1))
+
+
+def test_a_flock_model_may_be_a_function():
+    scenario = Scenario(n_sheep=3, n_flocks=1, shepherds=1, flock=drift)
+    world = World(scenario)
+    world.reset(0)
+    assert world.step(np.zeros((1, 2))).sheep_vel == pytest.approx(np.tile([0.7, 0.0], (3, 1)), abs=1e-6)
+    assert Scenario.from_dict(scenario.to_dict(), [drift]) == scenario
+    with pytest.raises(SettingsError, match="needs 'velocities', or to be a function like it"):
+        World(scenario.but(flock=3))
 
 
 # ----------------------------------------------------------------------- guards
@@ -404,7 +455,7 @@ def test_flock_models_that_answer_something_else_are_named(answer):
     if answer == [[1.0, 2.0]]:
         assert world.step([[0.0, 0.0]]).sheep_vel[0] == pytest.approx([1.0, 2.0])  # a list will do
     else:
-        with pytest.raises(ValueError, match=r"flock model \(Fixed\): velocities"):
+        with pytest.raises(ValueError, match=r"flock model \(test_world:Fixed\): velocities"):
             world.step([[0.0, 0.0]])
 
 
@@ -514,10 +565,10 @@ def test_actions_that_are_not_finite_move_nothing(bad):
 def test_flock_models_that_want_nonsense_are_named():
     world = lone(wanted=[[math.nan, 0.0]])
     put(world, [[0, 0]], [[5, 5]])
-    with pytest.raises(NonFiniteError, match=r"flock model \(Fixed\): velocities must be finite"):
+    with pytest.raises(NonFiniteError, match=r"flock model \(test_world:Fixed\): velocities must be finite"):
         world.step([[0.0, 0.0]])
     world.scenario.flock.wanted = np.zeros((3, 2))
-    with pytest.raises(ValueError, match=r"flock model \(Fixed\): velocities need shape \(1, 2\)"):
+    with pytest.raises(ValueError, match=r"flock model \(test_world:Fixed\): velocities need shape \(1, 2\)"):
         world.step([[0.0, 0.0]])
 
 
