@@ -16,6 +16,7 @@ from shepherd_phys.imperfections import Sight
 from shepherd_phys.lidar import Lidar, Scan
 from shepherd_phys.mirror import Side
 from shepherd_phys.observation import Stack, turn
+from shepherd_phys.placement import PlacementError
 from shepherd_phys.scenario import Scenario
 from shepherd_phys.settings import SettingsError
 from shepherd_phys.state import WorldState
@@ -25,6 +26,8 @@ from ._critic import N_NUMBERS, whole_world
 from .outcome import HeldSuccess, measures
 from .rewards import Earned, Scheme, earned, scans_for
 
+PLACEMENTS = 20
+"""Seeds and draws that are tried for an episode's world before it counts as one that cannot be placed."""
 Draw = Callable[[np.random.Generator, int], Scenario]
 """(random numbers, index of the world) -> the scenario of its next episode."""
 
@@ -129,16 +132,15 @@ class TeamWorld:
 
     def _begin(self) -> None:
         """Start the next episode."""
-        self.seed = int(self._seeds.integers(2**63))
-        scenario = self._plan.scenario
-        if not isinstance(scenario, Scenario):
-            scenario = scenario(self._draws, self.index)
-            if not isinstance(scenario, Scenario):
-                raise SettingsError(f"scenario: the function must give a Scenario (given: {scenario!r})")
-            self._world = World(with_team(scenario, self.n_shepherds))
-        elif self._world is None:
-            self._world = World(with_team(scenario, self.n_shepherds))
-        self.world.reset(self.seed)
+        for left in reversed(range(PLACEMENTS)):
+            self.seed = int(self._seeds.integers(2**63))
+            self._world = self._next_world()
+            try:
+                self._world.reset(self.seed)
+                break
+            except PlacementError:  # no room in this one draw: no reason to end a run that took hours
+                if not left:
+                    raise
         self.clock = self.decisions = 0
         self.returns = np.zeros(self.n_shepherds)
         self.beam_offset = np.zeros(self.n_shepherds, dtype=np.int64)
@@ -149,6 +151,16 @@ class TeamWorld:
         self._sight = Sight(self._plan.lidar, self.scenario.imperfections, self.world.sensing_rng)
         self._look()
         self._observe(first=True)
+
+    def _next_world(self) -> World:
+        """The world of the next episode, not yet placed: of the one scenario, or of another that is drawn."""
+        scenario = self._plan.scenario
+        if isinstance(scenario, Scenario):
+            return self._world or World(with_team(scenario, self.n_shepherds))
+        scenario = scenario(self._draws, self.index)
+        if not isinstance(scenario, Scenario):
+            raise SettingsError(f"scenario: the function must give a Scenario (given: {scenario!r})")
+        return World(with_team(scenario, self.n_shepherds))
 
     def decide(self, actions: NDArray[np.float32]) -> Ending | None:
         """Hold wanted velocities for a decision; rewards and observation are written in place.

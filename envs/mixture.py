@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, Field
 
 from shepherd_phys.layouts import Scattered
 from shepherd_phys.lidar import Channel
-from shepherd_phys.scenario import Scenario
+from shepherd_phys.scenario import Scenario, with_neighbours
 from shepherd_phys.settings import Settings, settings
 
 
@@ -74,18 +74,36 @@ class Mixture(Settings):
         n_flocks = int(rng.integers(*self.n_flocks, endpoint=True))
         base = self.bases[int(rng.integers(len(self.bases)))] if self.others else self.base
         if self.n_sheep is not None:
-            n_sheep = _between(rng, *self.n_sheep)
-            base = base.but(n_sheep=n_sheep, goal_radius=base.goal_radius * math.sqrt(n_sheep / base.n_sheep))
-        flock, layout = base.flock, base.layout
+            base = _with_sheep(base, _between(rng, *self.n_sheep))
         if self.n_neighbours is not None:
-            flock = flock.but(n_neighbours=int(rng.integers(*self.n_neighbours, endpoint=True)))
-        if self.density is not None and isinstance(layout, Scattered):
-            layout = layout.but(count=None, density=float(rng.uniform(*self.density)))
+            base = with_neighbours(base, int(rng.integers(*self.n_neighbours, endpoint=True)))
+        if self.density is not None and isinstance(base.layout, Scattered):
+            base = _with_density(base, float(rng.uniform(*self.density)))
         sizes = None
         if self.uneven and rng.random() < self.uneven:
             others = rng.multinomial(base.n_sheep - n_flocks, rng.dirichlet(np.ones(n_flocks)))
             sizes = tuple(int(1 + more) for more in others)
-        return base.but(n_flocks=n_flocks, flock=flock, flock_sizes=sizes, layout=layout)
+        return base.but(n_flocks=n_flocks, flock_sizes=sizes)
+
+    def extremes(self) -> list[Scenario]:
+        """Each base with the most sheep and obstacles that are drawn: what finds no room at all shows here."""
+        found = []
+        for base in self.bases:
+            if self.n_sheep is not None:
+                base = _with_sheep(base, self.n_sheep[1])
+            if self.density is not None and isinstance(base.layout, Scattered):
+                base = _with_density(base, self.density[1])
+            found.append(base)
+        return found
+
+
+def _with_sheep(base: Scenario, n: int) -> Scenario:
+    """As many sheep, and the goal's area with them."""
+    return base.but(n_sheep=n, goal_radius=base.goal_radius * math.sqrt(n / base.n_sheep))
+
+
+def _with_density(base: Scenario, density: float) -> Scenario:
+    return base.but(layout=base.layout.but(count=None, density=density))
 
 
 def _between(rng: np.random.Generator, least: int, most: int) -> int:

@@ -5,7 +5,6 @@ What `evaluate` and `reproduce` share. It is the place where envs and controller
 
 from __future__ import annotations
 
-import dataclasses
 import inspect
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
@@ -27,7 +26,7 @@ from shepherd_phys.controllers.evaluation import (
 )
 from shepherd_phys.controllers.summary import difference_columns, paired_differences, summarise, summary_columns
 from shepherd_phys.envs.shepherding import ShepherdingEnv
-from shepherd_phys.scenario import SCENARIOS, Scenario
+from shepherd_phys.scenario import SCENARIOS, Scenario, with_neighbours
 from shepherd_phys.settings import SettingsError, kind_of, meant
 from shepherd_phys.workers import explain
 from shepherd_phys.world import World
@@ -158,7 +157,7 @@ def points(
         if n_flocks is not None:
             varied["n_flocks"] = n_flocks
         if n_neighbours is not None:
-            varied["flock"] = _with_neighbours(base.flock, n_neighbours)
+            varied["flock"] = with_neighbours(base, n_neighbours).flock
         if n_shepherds is not None:
             varied["shepherds"] = _team(base, n_shepherds, default)
         found.append(Point(name, shown, base.but(**varied)))
@@ -358,14 +357,6 @@ def find_controller(name: str) -> Controller:
             f"or module:Name of your own{meant(name, CONTROLLERS)}"
         )
     return CONTROLLERS[name]()
-
-
-def _with_neighbours(flock: Any, n: int) -> Any:
-    if not hasattr(flock, "n_neighbours"):
-        raise SettingsError(f"cohesion: the flock model {kind_of(flock)} has no n_neighbours to set (given: {n})")
-    if hasattr(flock, "but"):
-        return flock.but(n_neighbours=n)
-    return dataclasses.replace(flock, n_neighbours=n)
 
 
 def _team(scenario: Scenario, n: int, default: Any) -> tuple[Any, ...]:

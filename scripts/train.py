@@ -16,6 +16,7 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+from shepherd_phys.envs._team_world import PLACEMENTS
 from shepherd_phys.layouts import Scattered
 from shepherd_phys.learning.folder import BEST, CURVE, POLICY, PRESET, VALIDATION, agree, begin
 from shepherd_phys.learning.preset import PRESETS, Preset, load_preset
@@ -50,7 +51,7 @@ class Train:
     init: Annotated[str | None, flag("NAME|FILE", "the preset's")] = None
     """Policy to start from: a shipped one's name or a .json file."""
     scenario: Annotated[str | None, flag("NAME|FILE|module:Name", "the preset's")] = None
-    """Scenario; where its flocks are is its own, and not the preset's, then."""
+    """Scenario, the only one then; where its flocks and obstacles are is its own, and not the preset's."""
     obstacles: Annotated[int | None, flag("COUNT", "the scenario's")] = None
     """Discs of radius 1 m, drawn anew for each episode: so many."""
     density: Annotated[float | None, flag("FRACTION", "the scenario's")] = None
@@ -111,7 +112,7 @@ def main(argv: Sequence[str]) -> int:
     return 0
 
 
-def prepare(options: Train, given: set[str], kinds: Mapping[str, type[Any]]) -> tuple[Path, Preset]:
+def prepare(options: Train, given: set[str], kinds: Mapping[str, Any]) -> tuple[Path, Preset]:
     """The folder of the run, and what its preset shall be; a new run's folder is made, another one left as it is.
 
     Args:
@@ -145,21 +146,22 @@ def prepare(options: Train, given: set[str], kinds: Mapping[str, type[Any]]) -> 
     folder = options.out or Path("runs") / "-".join(words)
     # before a folder is made that the next attempt would find
     preset.start()
-    if preset.scenario.has_obstacles or kinds or options.scenario is not None or not isinstance(preset.reward, str):
-        # is there room for obstacles, does anything of a user's own fail
-        try_out(World(preset.scenario), [preset.validation.seed], preset.scheme(), preset.lidar)
+    # is there room for all obstacles, was everything of a user's own handed over, does any of it fail
+    seeds = range(preset.validation.seed, preset.validation.seed + PLACEMENTS)
+    for scenario in preset.extremes():
+        try_out(World(scenario), seeds, preset.scheme(), preset.lidar)
     begin(folder, preset)
     return folder, preset
 
 
-def handed(options: Train, kinds: Mapping[str, type[Any]]) -> list[Any]:
+def handed(options: Train, kinds: Mapping[str, Any]) -> list[Any]:
     """What of a user's own the command line hands over: classes and functions."""
     scenario = None if options.scenario is None else find_scenario(options.scenario, kinds.values())
     reward = None if options.reward is None else find_reward(options.reward)
     return [*kinds.values(), *own_classes(scenario, reward)]
 
 
-def asked(preset: Preset, options: Train, given: set[str], kinds: Mapping[str, type[Any]]) -> Preset:
+def asked(preset: Preset, options: Train, given: set[str], kinds: Mapping[str, Any]) -> Preset:
     """The preset with what the flags change.
 
     Raises:
@@ -169,7 +171,8 @@ def asked(preset: Preset, options: Train, given: set[str], kinds: Mapping[str, t
     if options.reward is not None:
         preset = preset.but(reward=find_reward(options.reward))
     if options.scenario is not None:
-        preset = preset.but(scenario=find_scenario(options.scenario, kinds.values()), flock_distance=None)
+        scenario = find_scenario(options.scenario, kinds.values())
+        preset = preset.but(scenario=scenario, flock_distance=None, scenarios=(), density=None)
     if options.obstacles is not None and options.density is not None:
         raise SettingsError("--obstacles and --density: both say how many obstacles there are; leave one of them out")
     if options.obstacles is not None or options.density is not None:
@@ -185,7 +188,11 @@ def asked(preset: Preset, options: Train, given: set[str], kinds: Mapping[str, t
             )
         span = None if drawn is None else (options.density, options.density)  # what is drawn is no other then
         preset = preset.but(scenario=preset.scenario.but(layout=layout), density=span)
-    return preset.but(scenario=of_kinds(preset.scenario, kinds)[0]) if kinds else preset
+    if not kinds:
+        return preset
+    scenario = of_kinds(preset.scenario, kinds)[0]
+    drawn = preset.n_neighbours if hasattr(scenario.flock, "n_neighbours") else None
+    return preset.but(scenario=scenario, n_neighbours=drawn)
 
 
 @contextlib.contextmanager

@@ -284,12 +284,12 @@ def test_evaluation_names_it_and_identifies_it_by_its_checksum(policy_path):
 def test_it_runs_without_torch(policy_path):
     code = f"""
 import sys
+sys.modules["torch"] = sys.modules["stable_baselines3"] = None  # nobody can import them from here on
 from functools import partial
 from shepherd_phys.controllers import load_policy
 from shepherd_phys.controllers.evaluation import evaluate
 from shepherd_phys.envs import ShepherdingEnv
 from shepherd_phys.scenario import SCENARIOS
-sys.modules["torch"] = sys.modules["stable_baselines3"] = None
 print(len(evaluate(load_policy({str(policy_path)!r}), partial(ShepherdingEnv, SCENARIOS["small"].but(n_steps=3)), [1])))
 """
     run = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, check=False)

@@ -7,11 +7,14 @@ from gymnasium import spaces
 from stable_baselines3 import PPO
 from test_learned import LIDAR, SMALL, random_weights, spec_of
 
+from shepherd_phys.bodies import Unicycle
 from shepherd_phys.controllers import Policy, load_policy
 from shepherd_phys.controllers.network import Actor, SectorNetwork, input_shape
 from shepherd_phys.controllers.policy_files import Acting, PolicyError
 from shepherd_phys.envs.rewards import SCHEMES, Effort
 from shepherd_phys.envs.team import TeamVecEnv
+from shepherd_phys.flock import Reynolds
+from shepherd_phys.imperfections import Imperfections
 from shepherd_phys.layouts import Scattered
 from shepherd_phys.learning.export import actor_weights, load_actor, to_policy, to_sb3
 from shepherd_phys.learning.export import spec_of as spec_of_preset
@@ -278,6 +281,11 @@ def test_a_preset_may_learn_in_several_scenarios():
     kinds = {preset.draw()(np.random.default_rng(k), 0).layout is None for k in range(30)}
     assert kinds == {True, False}
     assert Preset.from_dict(preset.to_dict()) == preset
+    alike = TINY.scenario.but(imperfections=Imperfections(lost_beams=0.1), shepherds=(Unicycle(),))
+    shared = preset.but(scenario=alike).draw()
+    for drawn in (shared(np.random.default_rng(k), 0) for k in range(10)):
+        assert (drawn.imperfections, drawn.shepherds) == (alike.imperfections, alike.shepherds)
+        assert drawn.flock == alike.flock
     with pytest.raises(SettingsError, match="scenarios: 'moon' is not one of"):
         TINY.but(scenarios=("moon",))
     with pytest.raises(SettingsError, match="density: no base scatters"):
@@ -328,6 +336,8 @@ def test_validation_is_an_evaluation_on_its_own_seeds_and_disturbs_nothing(learn
     assert validator(policy) == rows
     assert torch.equal(torch.get_rng_state(), state[0])
     assert np.array_equal(np.random.get_state()[1], state[1])  # noqa: NPY002
+    boids = TINY.but(scenario=TINY.scenario.but(flock=Reynolds()), validation=Validation(flocks=(1,), cohesion=(5, 8)))
+    assert Validator(boids).points == [{"n_flocks": 1, "cohesion": None, "n_shepherds": 3}]
     rows = [{"in_goal_end": 90.0, "path_length": 200.0}, {"in_goal_end": 100.0, "path_length": 100.0}]
     assert validator.score(rows) == 95.0
     costly = Validator(TINY.but(validation=TINY.validation.but(path_cost=0.1)))
@@ -367,11 +377,14 @@ def test_a_preset_may_mix_worlds_and_price_effort():
     assert preset.scheme()["effort"] == (-2.0, Effort())
     assert preset.but(effort_team=3).scheme()["effort"] == (-2.0, Effort(team=3))
     assert preset.scheme()["gathered"][0] == 3.0
+    with pytest.raises(SettingsError, match="effort: the reward has a term of this name already"):
+        preset.but(reward={**SCHEMES["wild"], "effort": (-0.5, Effort())})
     assert set(TINY.scheme()) == set(SCHEMES["wild"])
     spec = spec_of_preset(TINY.but(rest=0.25, noise=0.5))
     assert spec.action == Acting(frame="goal", rest=0.25, noise=0.5, noise_steps=TINY.decision_interval)
     assert spec_of_preset(TINY.but(noise=0.0)).action == Acting(frame="goal", noise_steps=TINY.decision_interval)
     assert spec_of_preset(TINY.but(mirror="left")).action.mirror == "left"
+    assert spec_of_preset(TINY.but(mirror="left")).training["learns_mirrored"] is False
     assert not {"rest", "noise", "mirror"} & set(spec.training)
     far = TINY.but(flock_distance=(4.0, 5.0), uneven=1.0).draw()(np.random.default_rng(0), 0)
     assert far.flock_distance == (4.0, 5.0) and far.flock_sizes is not None and far.n_flocks == TINY.scenario.n_flocks

@@ -60,6 +60,14 @@ def test_a_mixture_gives_each_sheep_of_a_larger_herd_as_much_of_the_goal():
         mixture.but(n_sheep=(2, 9))
 
 
+def test_the_extremes_of_a_mixture_hold_the_most_that_is_drawn():
+    mixture = Mixture(base=SCENARIOS["scattered"], others=(SMALL,), n_flocks=(1, 2), n_sheep=(6, 24), density=(0, 0.2))
+    full, small = mixture.extremes()
+    assert (full.layout, full.n_sheep) == (Scattered(density=0.2), 24)
+    assert small.n_sheep == 24 and small.goal_radius == pytest.approx(2 * SMALL.goal_radius)
+    assert small.layout is None
+
+
 def test_a_mixture_draws_among_scenarios_and_densities():
     mixture = Mixture(
         base=SCENARIOS["scattered"],

@@ -16,6 +16,7 @@ from shepherd_phys.envs import WILD, ShepherdingEnv
 from shepherd_phys.envs import _critic as critic
 from shepherd_phys.envs.rewards import Effort
 from shepherd_phys.envs.team import TeamVecEnv
+from shepherd_phys.layouts import Scattered
 from shepherd_phys.lidar import Lidar
 from shepherd_phys.observation import turn
 from shepherd_phys.obstacles import Pillar
@@ -523,3 +524,29 @@ def test_presets_work_as_scenarios():
     env = TeamVecEnv("small", (2,), lidar=COMPACT)
     env.reset()
     assert env.get_attr("scenario", 0) == [SCENARIOS["small"]]
+
+
+class Crowded:
+    """A meadow with no room but in every third draw."""
+
+    def __init__(self, room=3):
+        self.room, self.drawn = room, 0
+
+    def __call__(self, rng, index):
+        self.drawn += 1
+        return SMALL if self.room and self.drawn % self.room == 0 else SMALL.but(n_sheep=200, box=4.0, layout=FULL)
+
+
+FULL = Scattered(density=0.5)
+
+
+def test_a_draw_that_finds_no_room_is_drawn_again():
+    draw = Crowded()
+    env = TeamVecEnv(draw, (2,), lidar=COMPACT, random_clocks=False)
+    env.reset()
+    assert (draw.drawn, env.get_attr("scenario")) == (3, [SMALL] * 2)
+    for _ in range(SMALL.n_steps):
+        env.step(np.zeros((2, 2)))
+    assert (draw.drawn, env.get_attr("decisions")) == (6, [0] * 2)
+    with pytest.raises(SettingsError, match="density: 0.5 is impossible"):
+        TeamVecEnv(Crowded(room=0), (2,), lidar=COMPACT).reset()

@@ -5,7 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shepherd_phys.layouts import Fenced, Scattered
+from shepherd_phys.bodies import DifferentialDrive
+from shepherd_phys.flock import Reynolds
+from shepherd_phys.layouts import Fenced, Lattice, Scattered
 from shepherd_phys.learning.folder import PRESET
 from shepherd_phys.learning.preset import PRESETS, Preset, load_preset
 from shepherd_phys.scripts.command import parsed
@@ -42,6 +44,38 @@ def test_a_scenario_says_where_its_flocks_are():
     preset = asked(load_preset("collie"), *parsed(Train, "train", ["--scenario", "fence"]), {})
     assert preset.flock_distance is None
     assert preset.draw().base.flock_distance == (14.0, 20.0)
+
+
+def test_a_scenario_that_is_asked_for_is_the_only_one():
+    preset = asked(load_preset("collie-obstacles"), *parsed(Train, "train", ["--scenario", "lattice"]), {})
+    draw, rng = preset.draw(), np.random.default_rng(0)
+    assert {type(draw(rng, 0).layout) for _ in range(30)} == {Lattice}
+
+
+def test_a_body_that_is_asked_for_is_that_of_every_episode():
+    kinds = {"body": DifferentialDrive, "flock": Reynolds}
+    preset = asked(load_preset("collie-obstacles"), *parsed(Train, "train", []), kinds)
+    draw, rng = preset.draw(), np.random.default_rng(0)
+    drawn = [draw(rng, 0) for _ in range(30)]
+    assert len({type(scenario.layout) for scenario in drawn}) > 2
+    assert {type(body) for scenario in drawn for body in scenario.shepherds} == {DifferentialDrive}
+    assert {scenario.flock for scenario in drawn} == {Reynolds()}  # which has no n to draw
+
+
+def test_a_body_that_was_not_handed_over_leaves_no_folder(tmp_path, capsys):
+    preset = tmp_path / "mine.toml"
+    preset.write_text('[scenario]\nshepherds = [{kind = "mine:Tank"}]\n')
+    assert main(["--preset", str(preset), "--out", str(tmp_path / "run")]) == 2
+    assert "mine:Tank" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_drawn_obstacles_that_find_no_room_are_found_out_before_anything_is_made(tmp_path, capsys):
+    preset = tmp_path / "mine.toml"
+    preset.write_text('scenarios = ["scattered"]\ndensity = [0.0, 0.45]\n')
+    assert main(["--preset", str(preset), "--out", str(tmp_path / "run")]) == 2
+    assert "density: 0.45 is impossible" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_density_that_is_asked_for_is_drawn_instead_of_the_presets():

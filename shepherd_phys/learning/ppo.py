@@ -57,7 +57,7 @@ class Learner:
             decision_interval=preset.decision_interval,
             credit=preset.credit,
             critic=preset.critic_sees,
-            mirror=preset.mirror,
+            mirror=preset.mirror if preset.learns_mirrored else "never",
             seed=preset.seed,
             n_workers=n_workers,
         )

@@ -113,7 +113,7 @@ class Validation(Settings):
     flocks: Counts = (1, 2, 5)
     """Numbers of flocks; every combination of the three lists is a point."""
     cohesion: Counts = (40,)
-    """Neighbours n that attract a sheep."""
+    """Neighbours n that attract a sheep, where the flock model has an n."""
     shepherds: Counts = (3,)
     """Team sizes."""
     trials: int = Field(default=4, ge=1, le=MOST_EPISODES)
@@ -156,7 +156,10 @@ class Preset(Settings):
     """Of the policy when it is deployed, and validated: standard deviations by which its actions scatter about their
     mean, each for as long as a decision while learning; see `shepherd_phys.controllers.policy_files.Acting`."""
     mirror: Side = "never"
-    """Which shepherds see the world in a mirror, while learning and when deployed; see `shepherd_phys.mirror`."""
+    """Of the policy when it is deployed, and validated: which shepherds see the world in a mirror; see
+    `shepherd_phys.mirror`."""
+    learns_mirrored: bool = False
+    """Whether they do so while learning, too."""
     credit: Literal["own", "team"] = "own"
     """Who is paid for a term that has shares: each shepherd by its own, or all by the mean."""
     decision_interval: int = Field(default=5, ge=1, le=1000)
@@ -177,12 +180,13 @@ class Preset(Settings):
     """Least and most sheep, drawn anew for every episode while learning, with their logarithm uniform, so that twice as
     many are as likely as half as many; the goal's area grows and shrinks with their number. None: the scenario's."""
     flock_distance: Span | None = None
-    """Least and largest distance of a flock's centre from the goal's while learning [m]; none: the scenario's."""
+    """Least and largest distance of a flock's centre from the goal's while learning [m]; none: the scenario's. Those of
+    ``scenarios`` keep their own."""
     uneven: float = Field(default=0.0, ge=0, le=1)
     """Fraction of the episodes whose flocks differ in size."""
     scenarios: Annotated[tuple[str, ...], BeforeValidator(listed)] = ()
     """Names of scenarios. Each episode while learning is in the scenario or in one of these, all with the same
-    probability. Validation is in the scenario."""
+    probability, and with the scenario's bodies, flock model and imperfections. Validation is in the scenario."""
     density: Fractions | None = None
     """Least and largest part of the box that scattered obstacles cover, drawn anew for every episode; none: the
     scenario's."""
@@ -210,6 +214,9 @@ class Preset(Settings):
         for name, (_, term) in self._terms().items():
             if not (callable(term) or isinstance(term, Foreign)):
                 raise ValueError(f"reward[{name!r}]: needs a term that can be called (given: {term!r})")
+        for name in ("effort", "gathered"):
+            if getattr(self, name) and name in self._terms():
+                raise ValueError(f"{name}: the reward has a term of this name already; rename it, or give {name} = 0")
         for name in self.scenarios:
             if name not in SCENARIOS:
                 raise ValueError(f"scenarios: {name!r} is not one of {', '.join(SCENARIOS)}")
@@ -297,7 +304,8 @@ class Preset(Settings):
 
     def draw(self) -> Scenario | Mixture:
         """The scenario, or what draws one for each episode."""
-        base = self.scenario.but(flock_distance=self.flock_distance) if self.flock_distance else self.scenario
+        own = self.scenario
+        base = own.but(flock_distance=self.flock_distance) if self.flock_distance else own
         drawn = (self.n_flocks, self.n_neighbours, self.n_sheep, self.uneven, self.scenarios, self.density)
         if not any(drawn):
             return base
@@ -306,10 +314,20 @@ class Preset(Settings):
             n_flocks=self.n_flocks or (base.n_flocks, base.n_flocks),
             n_neighbours=self.n_neighbours,
             n_sheep=self.n_sheep,
-            others=tuple(SCENARIOS[name] for name in self.scenarios),
+            others=tuple(
+                SCENARIOS[name].but(
+                    shepherds=own.shepherds, sheep=own.sheep, flock=own.flock, imperfections=own.imperfections
+                )
+                for name in self.scenarios
+            ),
             density=self.density,
             uneven=self.uneven,
         )
+
+    def extremes(self) -> list[Scenario]:
+        """The scenarios that episodes are in while learning, each with the most obstacles and sheep that are drawn."""
+        drawn = self.draw()
+        return [drawn] if isinstance(drawn, Scenario) else drawn.extremes()
 
     @property
     def reward_name(self) -> str:

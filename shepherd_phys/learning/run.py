@@ -262,7 +262,8 @@ class _Run:
             self.chosen[FIRST] = Chosen(score, steps, policy.weights)
         for row in rows:
             self._validations.add({**row, "checkpoint": self.number, "shepherd_steps": steps})
-            point = f"{row['n_flocks']}_flocks_n_{row['cohesion']}_{row['n_shepherds']}_shepherds"
+            n = "" if row["cohesion"] is None else f"n_{row['cohesion']}_"
+            point = f"{row['n_flocks']}_flocks_{n}{row['n_shepherds']}_shepherds"
             logger.record(f"validation/in_goal_end_{point}", row["in_goal_end"])
         logger.record("validation/score", score)
         logger.dump(learner.model.num_timesteps)

@@ -105,6 +105,8 @@ def variants() -> dict[str, Preset]:
         "fast-own-critic": fast.but(critic_sees="own"),
         "fast-every-step": deciding_every(fast, 1),
         "fast-alpha-0": fast.but(alpha=0.0),
+        # the paper's claim that this scheme fails: figure 1 has it with the goal straight ahead
+        "fast-original-world-frame": fast.but(reward="original", lidar=fast.lidar.but(frame="world")),
     }
     paper = load_preset("paper")
     added = paper.but(lidar=paper.lidar.but(sectors=fast.lidar.sectors), network=fast.network)

@@ -16,7 +16,7 @@ from shepherd_phys.envs._team_world import with_team
 from shepherd_phys.envs.shepherding import ShepherdingEnv
 from shepherd_phys.learning.folder import MEASURES
 from shepherd_phys.learning.preset import Preset
-from shepherd_phys.scenario import Scenario
+from shepherd_phys.scenario import Scenario, with_neighbours
 from shepherd_phys.workers import Job, Workers, finished
 
 TIMEOUT = 600.0
@@ -54,10 +54,10 @@ class Validator:
         self.points = [
             {"n_flocks": n_flocks, "cohesion": cohesion, "n_shepherds": n_shepherds}
             for n_flocks in self._settings.flocks
-            for cohesion in self._settings.cohesion
+            for cohesion in (self._settings.cohesion if hasattr(preset.scenario.flock, "n_neighbours") else (None,))
             for n_shepherds in self._settings.shepherds
         ]
-        """What the worlds are, in order."""
+        """What the worlds are, in order; ``cohesion`` is None where the flock model has no n."""
         self._scenarios = [_scenario(preset.scenario, point) for point in self.points]
         self._seeds = [trial_seed(self._settings.seed, trial) for trial in range(self._settings.trials)]
 
@@ -112,7 +112,6 @@ def validator(preset: Preset, n_workers: int) -> Iterator[Validator]:
 
 def _scenario(base: Scenario, point: Mapping[str, Any]) -> Scenario:
     """The scenario of a point."""
-    flock = base.flock
-    if hasattr(flock, "n_neighbours") and hasattr(flock, "but"):
-        flock = flock.but(n_neighbours=point["cohesion"])
-    return with_team(base.but(n_flocks=point["n_flocks"], flock=flock), point["n_shepherds"])
+    if point["cohesion"] is not None:
+        base = with_neighbours(base, point["cohesion"])
+    return with_team(base.but(n_flocks=point["n_flocks"]), point["n_shepherds"])
