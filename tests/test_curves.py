@@ -396,4 +396,5 @@ def test_no_variant_of_the_ablations_trains_longer_than_another():
     assert {(run.preset.budget, run.preset.validation.flocks) for run in runs} == {(2_500_000, (1, 2, 5))}
     lengths = [run.preset.n_rollouts * run.preset.rollout_steps for run in runs]
     assert min(lengths) >= 2_500_000 and max(lengths) <= 1.05 * min(lengths)
-    assert runs[0].preset.checkpoint_rollouts == load_preset("fast").checkpoint_rollouts
+    assert runs[0].preset.checkpoint_rollouts <= load_preset("fast").checkpoint_rollouts
+    assert ablations(1, 960_000)[0].preset == runs[0].preset.but(budget=960_000, checkpoint_rollouts=20)

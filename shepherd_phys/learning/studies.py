@@ -66,8 +66,8 @@ def figure1(n_seeds: int, budget: int, paper_hours: float) -> list[Run]:
 def ablations(n_seeds: int, budget: int) -> list[Run]:
     """The runs of the ablations, seed by seed, so that an unfinished study knows something about every variant.
 
-    Runs end with whole checkpoint intervals, which the presets count in rollouts: here all have intervals of as many
-    shepherd-steps as the first variant, `fast`, rounded up to whole rollouts, so that none trains longer than another.
+    Runs end with whole checkpoint intervals, which the presets count in rollouts: here the budget is cut into as many
+    as `fast` would need, rounded up to whole rollouts, so that none trains longer than another, nor than it must.
 
     Args:
         n_seeds: runs of each variant.
@@ -75,7 +75,7 @@ def ablations(n_seeds: int, budget: int) -> list[Run]:
     """
     compared = variants()
     first = next(iter(compared.values()))
-    interval = first.checkpoint_rollouts * first.rollout_steps
+    interval = budget / math.ceil(budget / (first.checkpoint_rollouts * first.rollout_steps))
     return [
         Run(
             f"ablation-{name}-{seed}",
