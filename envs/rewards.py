@@ -133,11 +133,16 @@ class Effort(Settings):
     team: int = Field(default=1, ge=1, le=1000)
     """Shepherds of the smallest team that pays in full; P fewer pay P / ``team`` of it. The work to be done is that of
     the sheep: a lone shepherd must walk for three, and would rather not for the price that three can pay."""
+    herd: int | None = Field(default=None, ge=1)
+    """Sheep of the largest herd for which it is paid in full; N more pay (``herd`` / N)^2 of it. None: all herds.
+    A large herd at rest lies about a goal into which it fits only where it is pressed from all sides (measured)."""
 
     def shares(self, before: WorldState, after: WorldState, scan: Scan | None, scenario: Scenario) -> Floats:
-        """(P,) each shepherd's speed over its top speed, over T; in teams smaller than ``team`` less."""
+        """(P,) each shepherd's speed over its top speed, over T; less in small teams and large herds."""
         walked = after.shepherd_path - before.shepherd_path
         price = min(after.n_shepherds / self.team, 1.0)
+        if self.herd is not None:
+            price *= min(self.herd / after.n_sheep, 1.0) ** 2
         return np.asarray(walked * price / (after.shepherd_max_speed * (scenario.control_dt * scenario.n_steps)))
 
     def __call__(self, before: WorldState, after: WorldState, scan: Scan | None, scenario: Scenario) -> float:

@@ -376,6 +376,7 @@ def test_a_preset_may_mix_worlds_and_price_effort():
     assert 1 <= drawn.n_flocks <= 3 and drawn.flock == TINY.scenario.flock
     assert preset.scheme()["effort"] == (-2.0, Effort())
     assert preset.but(effort_team=3).scheme()["effort"] == (-2.0, Effort(team=3))
+    assert preset.but(effort_herd=90).scheme()["effort"] == (-2.0, Effort(herd=90))
     assert preset.scheme()["gathered"][0] == 3.0
     with pytest.raises(SettingsError, match="effort: the reward has a term of this name already"):
         preset.but(reward={**SCHEMES["wild"], "effort": (-0.5, Effort())})

@@ -67,6 +67,9 @@ def test_effort_is_the_path_over_that_of_running_all_the_time():
     start = WorldState.of({**vars(env.state), "shepherd_path": np.zeros(2)})
     for team, price in ((1, 1.0), (2, 1.0), (3, 2 / 3), (8, 0.25)):  # two of them are a small team for the last two
         assert Effort(team=team).shares(start, env.state, None, scenario) == pytest.approx(price * own, rel=1e-12)
+    assert scenario.n_sheep == 4
+    for herd, price in ((9, 1.0), (4, 1.0), (3, 9 / 16), (1, 1 / 16)):
+        assert Effort(herd=herd).shares(start, env.state, None, scenario) == pytest.approx(price * own, rel=1e-12)
     nobody = WorldState.of({**vars(env.state), "shepherd_path": np.zeros(0), "shepherd_max_speed": np.zeros(0)})
     assert effort(nobody, nobody, None, scenario) == 0.0
 

@@ -145,6 +145,8 @@ class Preset(Settings):
     """Weight of the cost of walking; 0: none."""
     effort_team: int = Field(default=1, ge=1, le=1000)
     """Smallest team that pays it in full; see `shepherd_phys.envs.rewards.Effort`."""
+    effort_herd: int | None = Field(default=None, ge=1)
+    """Largest herd for which it is paid in full; none: all. See `shepherd_phys.envs.rewards.Effort`."""
     gathered: float = Field(default=0.0, ge=0)
     """Weight of what is paid for while the herd is in the goal, all but a few; 0: nothing."""
     alpha: float | None = Field(default=None, ge=0)
@@ -349,7 +351,7 @@ class Preset(Settings):
                 if isinstance(term, Occlusion):
                     scheme[name] = (weight, term.but(alpha=self.alpha))
         if self.effort:
-            scheme["effort"] = (-self.effort, Effort(team=self.effort_team))
+            scheme["effort"] = (-self.effort, Effort(team=self.effort_team, herd=self.effort_herd))
         if self.gathered:
             scheme["gathered"] = (self.gathered, Gathered())
         return scheme
