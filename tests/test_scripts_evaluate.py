@@ -617,7 +617,7 @@ MISTAKES = [
     ("--scenario mine:Nobody", "scenario: mine:Nobody: module 'mine' has no 'Nobody'"),
     ("--body mine:Stuck", "TypeError: Stuck.follow() takes 3 positional arguments but 4 were given"),
     ("--body mine:Dizzy", "Dizzy.follow: velocity and spin must be finite"),
-    ("--flock mine:Lost", "flock model (Lost): velocities need shape (6, 2) (given: (2,))"),
+    ("--flock mine:Lost", "flock model (mine:Lost): velocities need shape (6, 2) (given: (2,))"),
     ("--scenario broken.toml --body mine:Cart", "Scenario.shepherds[0]: mine:Cart: a cart has a size"),
     ("--scenario full.toml", "obstacles"),
     ("--grid nowhere.toml", "nowhere.toml: cannot be read"),

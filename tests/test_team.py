@@ -16,10 +16,10 @@ from shepherd_phys.envs import WILD, ShepherdingEnv
 from shepherd_phys.envs import _critic as critic
 from shepherd_phys.envs.rewards import Effort
 from shepherd_phys.envs.team import TeamVecEnv
-from shepherd_phys.layouts import Scattered
 from shepherd_phys.lidar import Lidar
 from shepherd_phys.observation import turn
 from shepherd_phys.obstacles import Pillar
+from shepherd_phys.placement import PlacementError
 from shepherd_phys.scenario import SCENARIOS
 from shepherd_phys.settings import SettingsError
 
@@ -526,6 +526,10 @@ def test_presets_work_as_scenarios():
     assert env.get_attr("scenario", 0) == [SCENARIOS["small"]]
 
 
+def no_room(rng, site):
+    raise PlacementError("no room")
+
+
 class Crowded:
     """A meadow with no room but in every third draw."""
 
@@ -534,10 +538,7 @@ class Crowded:
 
     def __call__(self, rng, index):
         self.drawn += 1
-        return SMALL if self.room and self.drawn % self.room == 0 else SMALL.but(n_sheep=200, box=4.0, layout=FULL)
-
-
-FULL = Scattered(density=0.5)
+        return SMALL if self.room and self.drawn % self.room == 0 else SMALL.but(layout=no_room)
 
 
 def test_a_draw_that_finds_no_room_is_drawn_again():
@@ -548,5 +549,5 @@ def test_a_draw_that_finds_no_room_is_drawn_again():
     for _ in range(SMALL.n_steps):
         env.step(np.zeros((2, 2)))
     assert (draw.drawn, env.get_attr("decisions")) == (6, [0] * 2)
-    with pytest.raises(SettingsError, match="density: 0.5 is impossible"):
+    with pytest.raises(SettingsError, match="no room"):
         TeamVecEnv(Crowded(room=0), (2,), lidar=COMPACT).reset()
