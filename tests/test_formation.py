@@ -72,7 +72,7 @@ def test_every_tuned_team_delivers_two_flocks_and_holds_them(name, n_shepherds):
     controller = CONTROLLERS[name]()
     observation, _ = env.reset(seed=1)
     controller.reset(env.user_rng)
-    for _ in range(700):
+    for _ in range(1000):  # the whole episode: six of strombom are still on their way after 700
         observation, *_, info = env.step(controller.act(observation, env.state))
     assert info["in_goal"] > 0.9
 
