@@ -52,6 +52,7 @@ def figure1_page(curves: Sequence[Row], validations: Sequence[Row], home: Sequen
         lasts = _lasts(curves, recipe, reward)
         paced = [row for row in lasts if (recipe, reward) == TIMED_SCHEME and row["seed"] in timed]
         paced = paced or (lasts if recipe == "paper" else [])
+        pace = [_rate(paced), clock(_total(paced, "seconds") / len(paced))] if paced else ["", ""]
         off = levels_off_at(curve)
         at_end = _at_end(validations, recipe, reward)
         lines.append(
@@ -63,8 +64,7 @@ def figure1_page(curves: Sequence[Row], validations: Sequence[Row], home: Sequen
                     _number(final_value(curve), ".2f"),
                     _levels_off(off, lasts),
                     *(_number(_mean(at_end.get(k, [])), ".1f") for k in flocks),
-                    _rate(paced) if paced else "",
-                    clock(_total(paced, "seconds") / len(paced)) if paced else "",
+                    *pace,
                 ]
             )
         )

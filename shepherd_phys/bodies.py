@@ -271,15 +271,6 @@ def flies(body: Body) -> bool:
     return bool(getattr(body, "flies", False))
 
 
-def mass_of(body: Body, who: str) -> float:
-    """A body's mass [kg]: as a library body tells it, or a user's own is built.
-
-    Raises:
-        SettingsError: as of `built`.
-    """
-    return float(getattr(body, "mass") if isinstance(body, Settings) else built(body, who)[0].mass)  # noqa: B009
-
-
 def built(body: Body, who: str) -> tuple[pymunk.Body, list[pymunk.Shape], float]:
     """Build a body and check what came: the world must never be handed a broken one.
 

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, Field
 
 from shepherd_phys.avoidance import Avoidance
-from shepherd_phys.bodies import BODIES, SHEEP, Body, Disc, flies, mass_of
+from shepherd_phys.bodies import BODIES, SHEEP, Body, Disc, built, flies
 from shepherd_phys.flock import FLOCKS, FlockModel, Strombom
 from shepherd_phys.imperfections import Imperfections
 from shepherd_phys.layouts import LAYOUTS, Corridor, Fenced, Lattice, Layout, Scattered
@@ -184,11 +184,11 @@ class Scenario(Settings):
         """Engine steps in a control step."""
         if self.substeps or not self.has_obstacles:
             return self.substeps or OPEN_SUBSTEPS
-        lightest = min(mass_of(body, "sheep") for body in self.sheep_kinds)
-        pressing = (body for body in self.shepherds if not flies(body))
+        lightest = min(built(body, "sheep")[0].mass for body in self.sheep_kinds)
         hard = any(
-            mass_of(body, f"shepherd {k}") > PRESSING[0] * lightest or body.max_speed > PRESSING[1]
-            for k, body in enumerate(pressing)
+            built(body, f"shepherd {k}")[0].mass > PRESSING[0] * lightest or body.max_speed > PRESSING[1]
+            for k, body in enumerate(self.shepherds)
+            if not flies(body)
         )
         return PRESSED_SUBSTEPS if hard else OBSTACLE_SUBSTEPS
 

@@ -59,8 +59,9 @@ class World:
             if isinstance(thing, type):
                 raise SettingsError(f"{kind_of(thing)}: a class was given; make one of it: {thing.__name__}()")
         self._velocities = getattr(scenario.flock, "velocities", scenario.flock)
+        self._flock = kind_of(scenario.flock)  # for errors
         if not callable(self._velocities):
-            raise SettingsError(f"flock ({kind_of(scenario.flock)}): needs 'velocities', or to be a function like it")
+            raise SettingsError(f"flock ({self._flock}): needs 'velocities', or to be a function like it")
         self.scenario = scenario
         self._h, self._substeps = scenario.physics_dt, scenario.n_substeps
         self._n = scenario.n_sheep
@@ -195,16 +196,17 @@ class World:
         # before the flock draws its random numbers: a refused action must change nothing
         if not _motion.command_shepherds(action, self._speed, command):
             raise NonFiniteError("action: every number must be finite")
-        flock = kind_of(scenario.flock)
         wanted = self._velocities(state, self._noise)
         try:
             wanted = np.asarray(wanted, dtype=np.float64)
         except (TypeError, ValueError):
-            raise ValueError(f"flock model ({flock}): velocities must be numbers (given: {wanted!r})") from None
+            raise ValueError(f"flock model ({self._flock}): velocities must be numbers (given: {wanted!r})") from None
         if wanted.shape != (self._n, 2):
-            raise ValueError(f"flock model ({flock}): velocities need shape ({self._n}, 2) (given: {wanted.shape})")
+            raise ValueError(
+                f"flock model ({self._flock}): velocities need shape ({self._n}, 2) (given: {wanted.shape})"
+            )
         if not _motion.command_sheep(wanted, command):
-            raise NonFiniteError(f"flock model ({flock}): velocities must be finite")
+            raise NonFiniteError(f"flock model ({self._flock}): velocities must be finite")
 
         limits = scenario.max_acceleration, scenario.max_angular_acceleration
         if self._followers:

@@ -62,19 +62,18 @@ def test_a_body_that_is_asked_for_is_that_of_every_episode():
     assert {scenario.flock for scenario in drawn} == {Reynolds()}  # which has no n to draw
 
 
-def test_a_body_that_was_not_handed_over_leaves_no_folder(tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('[scenario]\nshepherds = [{kind = "mine:Tank"}]\n', "mine:Tank"),  # not handed over
+        ('scenarios = ["scattered"]\ndensity = [0.0, 0.45]\n', "density: 0.45 is impossible"),  # no room for the most
+    ],
+)
+def test_a_preset_that_cannot_be_leaves_no_folder(text, message, tmp_path, capsys):
     preset = tmp_path / "mine.toml"
-    preset.write_text('[scenario]\nshepherds = [{kind = "mine:Tank"}]\n')
+    preset.write_text(text)
     assert main(["--preset", str(preset), "--out", str(tmp_path / "run")]) == 2
-    assert "mine:Tank" in capsys.readouterr().err
-    assert not (tmp_path / "run").exists()
-
-
-def test_drawn_obstacles_that_find_no_room_are_found_out_before_anything_is_made(tmp_path, capsys):
-    preset = tmp_path / "mine.toml"
-    preset.write_text('scenarios = ["scattered"]\ndensity = [0.0, 0.45]\n')
-    assert main(["--preset", str(preset), "--out", str(tmp_path / "run")]) == 2
-    assert "density: 0.45 is impossible" in capsys.readouterr().err
+    assert message in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
 
 
