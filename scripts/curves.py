@@ -14,8 +14,19 @@ from typing import Any, NamedTuple
 from shepherd_phys.controllers.curves import COLUMNS
 from shepherd_phys.learning import checkpoints
 from shepherd_phys.learning.checkpoints import CheckpointError
-from shepherd_phys.learning.folder import CHECKPOINTS, CURVE, PRESET, VALIDATION, agree, begin, ended, exported
-from shepherd_phys.learning.studies import Run
+from shepherd_phys.learning.folder import (
+    CHECKPOINTS,
+    CURVE,
+    FIRST,
+    LOCK,
+    PRESET,
+    VALIDATION,
+    agree,
+    begin,
+    ended,
+    exported,
+)
+from shepherd_phys.learning.studies import HOME, Run
 from shepherd_phys.settings import SettingsError
 from shepherd_phys.workers import Job, Workers, WorkersError, finished
 
@@ -50,6 +61,8 @@ class Failed(NamedTuple):
 def unfinished(runs: Iterable[Run], folder: Path) -> list[Run]:
     """Those of the runs whose end no checkpoint holds, or whose policy files are not those of the last one.
 
+    Of a run that is kept without its checkpoints the tables tell whether it is whole, see `_told`.
+
     Raises:
         SettingsError: a folder holds a run with other settings, or checkpoints that cannot be read.
     """
@@ -66,7 +79,40 @@ def _whole(run: Run, place: Path) -> bool:
         raise SettingsError(f"{error}; another --out begins anew") from None
     except CheckpointError as error:
         raise SettingsError(str(error)) from None
-    return saved is not None and ended(saved, run.preset.n_rollouts, 3600.0 * run.hours) and exported(place, saved)
+    if saved is None:
+        return _told(run, place)
+    return ended(saved, run.preset.n_rollouts, 3600.0 * run.hours) and exported(place, saved)
+
+
+def _told(run: Run, place: Path) -> bool:
+    """Whether a folder without checkpoints holds all that a study asks of a finished run: it is small enough to keep.
+
+    That is the preset, the curve, the validations to its end and, if it is judged in the end, the first policy that
+    passed. Where somebody trained, there is a lock: its run may have been killed before its first checkpoint.
+    """
+    if (place / LOCK).exists() or not ((place / CURVE).exists() and (place / VALIDATION).exists()):
+        return False
+    rows = read_rows(place / CURVE, ("rollout", "seconds"))
+    judged = read_rows(place / VALIDATION, ("checkpoint", "in_goal_end"))
+    if not rows or not judged:
+        return False
+    done, interval = rows[-1]["rollout"], run.preset.checkpoint_rollouts
+    if done % interval or max(row["checkpoint"] for row in judged) != done // interval:
+        return False
+    if done < run.preset.n_rollouts and rows[-1]["seconds"] < 3600.0 * run.hours:
+        return False
+    return not run.timed or (place / FIRST).exists() or home_at(judged) is None
+
+
+def home_at(rows: Iterable[Row]) -> int | None:
+    """The first checkpoint of a run whose validation found `HOME` percent of the sheep delivered at every point.
+
+    None where there is no such checkpoint.
+    """
+    checkpoints: dict[int, list[float]] = {}
+    for row in rows:
+        checkpoints.setdefault(row["checkpoint"], []).append(row["in_goal_end"])
+    return min((number for number, own in checkpoints.items() if min(own) >= HOME), default=None)
 
 
 def one_by_one(runs: Sequence[Run], folder: Path, workers: int) -> list[Failed]:

@@ -17,11 +17,11 @@ from shepherd_phys.controllers.evaluation import trial_seed
 from shepherd_phys.controllers.summary import intervals
 from shepherd_phys.learning import studies
 from shepherd_phys.learning.folder import FIRST
-from shepherd_phys.learning.studies import HOME, Run
+from shepherd_phys.learning.studies import Run
 from shepherd_phys.settings import SettingsError
 
 from .campaigns import lost, opened
-from .curves import VALIDATIONS, Row, gather, one_by_one, read_rows, side_by_side, unfinished
+from .curves import VALIDATIONS, Row, gather, home_at, one_by_one, read_rows, side_by_side, unfinished
 from .learning_pages import ablations_page, figure1_page
 from .pages import claims_page
 from .points import points, tasks
@@ -171,16 +171,14 @@ def time_to_home(runs: Sequence[Run], validations: Sequence[Row]) -> list[Row]:
     """
     rows: list[Row] = []
     for run in runs:
-        checkpoints: dict[int, list[Row]] = {}
-        for row in validations:
-            if (row["recipe"], row["reward"], row["seed"]) == (run.recipe, run.preset.reward, run.preset.seed):
-                checkpoints.setdefault(row["checkpoint"], []).append(row)
-        passing = [number for number, own in checkpoints.items() if all(row["in_goal_end"] >= HOME for row in own)]
+        labels = (run.recipe, run.preset.reward, run.preset.seed)
+        own = [row for row in validations if (row["recipe"], row["reward"], row["seed"]) == labels]
         empty = dict.fromkeys(HOME_COLUMNS)
-        if not passing:
+        first = home_at(own)
+        if first is None:
             rows.append({**empty, "seed": run.preset.seed})
             continue
-        for row in checkpoints[min(passing)]:
+        for row in [row for row in own if row["checkpoint"] == first]:
             told = {name: row[name] for name in ("seed", "checkpoint", "shepherd_steps", "seconds", "n_flocks")}
             rows.append({**empty, **told, "validated": row["in_goal_end"]})
     return rows

@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -50,7 +51,7 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.setattr(studies, "figure1", runs)
     monkeypatch.setattr(studies, "FIGURE1", JUDGED)
     monkeypatch.setattr("shepherd_phys.learning.validation.Validator.passes", lambda self, rows: True)
-    monkeypatch.setattr("shepherd_phys.scripts.studies.HOME", 0.0)
+    monkeypatch.setattr("shepherd_phys.scripts.curves.HOME", 0.0)
     return tmp_path
 
 
@@ -188,6 +189,35 @@ def test_policies_that_a_kill_left_out_are_written_again(folder, monkeypatch, ca
     for path in before:
         load_policy(path)
     assert Path("o/training/any-0/curve.csv").read_bytes() == curve
+
+
+def test_a_finished_run_can_be_kept_without_its_checkpoints(folder, capsys, monkeypatch):
+    assert figure1("--paper-hours", "1e-9") == 0
+    before = {path.name: path.read_bytes() for path in Path("o").iterdir() if path.suffix in {".csv", ".md", ".json"}}
+    kept = {"preset.toml", "curve.csv", "validation.csv", "first.json", "first.safetensors"}
+    for path in list(Path("o/training").glob("*/*")):
+        if path.name not in kept or (path.stem == "first" and path.parent.name != "wild-0"):
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+    with monkeypatch.context() as patch:
+        patch.setattr("shepherd_phys.scripts.curves._train", None)  # nothing is left to be trained
+        assert figure1("--paper-hours", "1e-9") == 0
+        assert {name: Path("o", name).read_bytes() for name in before} == before
+    again = []
+
+    def train_it(run, place, workers):
+        again.append(run.name)
+        return "not now"
+
+    monkeypatch.setattr("shepherd_phys.scripts.curves._train", train_it)
+    assert figure1("--paper-hours", "1e-9", budget=720) == 1
+    assert again == ["wild-0", "any-0"]  # longer, they are not whole; the paper's run has a time
+    again.clear()
+    Path("o/training/wild-0/first.json").unlink()  # which its reported trials need
+    rows = Path("o/training/any-0/validation.csv").read_text().splitlines()
+    Path("o/training/any-0/validation.csv").write_text("\n".join(rows[:-2]) + "\n")  # the end is not judged
+    Path("o/training/paper-wild-7/curve.csv").unlink()
+    assert figure1("--paper-hours", "1e-9") == 1
+    assert again == ["wild-0", "any-0", "paper-wild-7"]
 
 
 def test_a_folder_with_other_settings_is_left_alone(folder, capsys):
