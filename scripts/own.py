@@ -29,8 +29,12 @@ def find_kinds(body: str | None, flock: str | None) -> dict[str, Any]:
     Raises:
         SettingsError: there is none of a name.
     """
-    named = {"body": (body, BODIES), "flock": (flock, FLOCKS)}
-    return {where: find_class(name, known, where) for where, (name, known) in named.items() if name is not None}
+    kinds = {}
+    if body is not None:
+        kinds["body"] = find_class(body, BODIES, "body")
+    if flock is not None:
+        kinds["flock"] = find_class(flock, FLOCKS, "flock", or_function=True)
+    return kinds
 
 
 def find_scenario(name: str, classes: Iterable[type[Any]] = ()) -> Scenario:
@@ -142,8 +146,8 @@ def try_out(world: World, seeds: Sequence[int], scheme: Scheme | None = None, li
         raise SettingsError(explain(error)) from None
 
 
-def find_class(name: str, known: dict[str, type[Any]], where: str) -> Any:
-    """A class by its name among ``known`` or by ``module:Name``; as a flock model a function, too.
+def find_class(name: str, known: dict[str, type[Any]], where: str, or_function: bool = False) -> Any:
+    """A class by its name among ``known`` or by ``module:Name``, which may be that of a function where one will do.
 
     Raises:
         SettingsError: there is none.
@@ -156,8 +160,8 @@ def find_class(name: str, known: dict[str, type[Any]], where: str) -> Any:
             )
         return known[name]
     own = imported(name, where)
-    if not (inspect.isclass(own) or (where == "flock" and inspect.isroutine(own))):
-        wanted = "a class or a function" if where == "flock" else "a class"
+    if not (inspect.isclass(own) or (or_function and inspect.isroutine(own))):
+        wanted = "a class or a function" if or_function else "a class"
         raise SettingsError(f"{where}: {name}: needs {wanted} (it is a {type(own).__name__})")
     return own
 

@@ -156,11 +156,10 @@ def points(
         varied: dict[str, Any] = {}
         if n_flocks is not None:
             varied["n_flocks"] = n_flocks
-        if n_neighbours is not None:
-            varied["flock"] = with_neighbours(base, n_neighbours).flock
         if n_shepherds is not None:
             varied["shepherds"] = _team(base, n_shepherds, default)
-        found.append(Point(name, shown, base.but(**varied)))
+        own = base if n_neighbours is None else with_neighbours(base, n_neighbours)
+        found.append(Point(name, shown, own.but(**varied)))
     return found
 
 

@@ -19,8 +19,9 @@ from shepherd_phys.layouts import Scattered
 from shepherd_phys.learning.export import actor_weights, load_actor, to_policy, to_sb3
 from shepherd_phys.learning.export import spec_of as spec_of_preset
 from shepherd_phys.learning.network import TeamPolicy
+from shepherd_phys.learning.parts import CriticNetwork, PPOSettings, Validation
 from shepherd_phys.learning.ppo import Learner, TrainingError
-from shepherd_phys.learning.preset import PRESETS, CriticNetwork, PPOSettings, Preset, Validation, load_preset
+from shepherd_phys.learning.preset import PRESETS, Preset, load_preset
 from shepherd_phys.learning.validation import Validator
 from shepherd_phys.lidar import CHANNELS, Lidar
 from shepherd_phys.obstacles import Pillar
@@ -409,6 +410,7 @@ def test_a_preset_may_mix_worlds_and_price_effort():
         ("team_sizes = []", "team_sizes"),
         ("team_sizes = [0]", "team_sizes"),
         ("critic_first = 3", "critic_first: makes sense only with init"),
+        ("learns_mirrored = true", "learns_mirrored: makes sense only with a mirror"),
         ("reward = 'original'\nalpha = 1.0", "alpha: the reward 'original' has no occlusion term"),
         ("lidar = 3", "lidar: must be a table"),
         ("scenario = 'moon'", "scenario: must be a table"),

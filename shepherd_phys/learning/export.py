@@ -18,7 +18,8 @@ from shepherd_phys.controllers.network import input_shape
 from shepherd_phys.controllers.policy_files import PolicyError, PolicySpec, write_policy
 from shepherd_phys.envs.rewards import to_table
 from shepherd_phys.learning.network import SectorFeatures, TeamPolicy
-from shepherd_phys.learning.preset import CriticNetwork, Preset
+from shepherd_phys.learning.parts import CriticNetwork
+from shepherd_phys.learning.preset import Preset
 
 
 def spec_of(preset: Preset, shepherd_steps: int = 0) -> PolicySpec:

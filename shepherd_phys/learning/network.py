@@ -11,7 +11,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, MlpExtr
 from torch import nn
 
 from shepherd_phys.controllers.network import SectorNetwork
-from shepherd_phys.learning.preset import CriticNetwork
+from shepherd_phys.learning.parts import CriticNetwork
 from shepherd_phys.settings import SettingsError
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from shepherd_phys.learning.preset import Preset, Validation, load_preset
+from shepherd_phys.learning.parts import Validation
+from shepherd_phys.learning.preset import Preset, load_preset
 
 FIRST_SEED = 1_000_000
 """Of training; run k of a scheme has this plus k."""
