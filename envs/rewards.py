@@ -133,16 +133,11 @@ class Effort(Settings):
     team: int = Field(default=1, ge=1, le=1000)
     """Shepherds of the smallest team that pays in full; P fewer pay P / ``team`` of it. The work to be done is that of
     the sheep: a lone shepherd must walk for three, and would rather not for the price that three can pay."""
-    herd: int | None = Field(default=None, ge=1)
-    """Sheep of the largest herd for which it is paid in full; N more pay (``herd`` / N)^2 of it. None: all herds.
-    A large herd at rest lies about a goal into which it fits only where it is pressed from all sides (measured)."""
 
     def shares(self, before: WorldState, after: WorldState, scan: Scan | None, scenario: Scenario) -> Floats:
-        """(P,) each shepherd's speed over its top speed, over T; less in small teams and large herds."""
+        """(P,) each shepherd's speed over its top speed, over T; less in small teams."""
         walked = after.shepherd_path - before.shepherd_path
         price = min(after.n_shepherds / self.team, 1.0)
-        if self.herd is not None:
-            price *= min(self.herd / after.n_sheep, 1.0) ** 2
         return np.asarray(walked * price / (after.shepherd_max_speed * (scenario.control_dt * scenario.n_steps)))
 
     def __call__(self, before: WorldState, after: WorldState, scan: Scan | None, scenario: Scenario) -> float:
@@ -167,6 +162,47 @@ class Gathered(Settings):
         return float(np.count_nonzero(after.sheep_in_goal) / after.n_sheep >= self.fraction) / scenario.n_steps
 
 
+@settings
+class Ring(Settings):
+    """While the herd is home, mean over the shepherds of their nearness to a ring about the goal, over T: 1 at most.
+
+    In none of the paper's schemes. Three or more who stand on such a ring press a herd in from all sides and hold it
+    (as the tuned heuristics do); nearer they drive it out, and from further off a large herd lies about the goal and
+    does not fall in.
+    """
+
+    inner: float = Field(default=9.0, gt=0)
+    """Nearest place that is paid in full [m], from the goal's centre."""
+    outer: float = Field(default=10.5, gt=0)
+    """Furthest place that is paid in full [m]."""
+    fade: float = Field(default=4.0, gt=0)
+    """So far from the ring nothing is paid [m]."""
+    home: float = Field(default=3.0, gt=0)
+    """The herd is home when no sheep is further outside the goal's border [m]."""
+    team: int = Field(default=3, ge=1, le=1000)
+    """Shepherds of the smallest team that has to stand there. Fewer would drive the herd out on the far side: they are
+    paid in full wherever they stand."""
+
+    def __post_init__(self) -> None:
+        if self.outer < self.inner:
+            raise ValueError(f"outer: must be at least inner, {self.inner} (given: {self.outer})")
+
+    def shares(self, before: WorldState, after: WorldState, scan: Scan | None, scenario: Scenario) -> Floats:
+        """(P,) each shepherd's nearness, over T."""
+        if after.sheep_goal_distance.max() > self.home:
+            return np.zeros(after.n_shepherds)
+        if after.n_shepherds < self.team:
+            return np.full(after.n_shepherds, 1.0 / scenario.n_steps)
+        away = np.hypot(*(after.shepherd_pos - after.goal_pos).T)
+        off = np.maximum(self.inner - away, away - self.outer)
+        return np.asarray(np.clip(1.0 - off / self.fade, 0.0, 1.0) / scenario.n_steps)
+
+    def __call__(self, before: WorldState, after: WorldState, scan: Scan | None, scenario: Scenario) -> float:
+        """Mean of the shares, 0 where there is no shepherd."""
+        shares = self.shares(before, after, scan, scenario)
+        return float(shares.mean()) if len(shares) else 0.0
+
+
 Scheme = Mapping[str, tuple[float, Term]]
 
 ORIGINAL: dict[str, tuple[float, Term]] = {"occupy": (10.0, Occupancy()), "distance": (-0.1, Distance())}
@@ -177,7 +213,7 @@ WILD: dict[str, tuple[float, Term]] = {**ORIGINAL, "occlude": (0.1, Occlusion(sh
 """The paper's "Wild Sheep"."""
 SCHEMES: dict[str, Scheme] = {"original": ORIGINAL, "any": ANY, "wild": WILD}
 """By name, for ``gymnasium.make`` and the command line."""
-TERMS: dict[str, type[Any]] = {term.__name__: term for term in (Occupancy, Distance, Occlusion, Effort, Gathered)}
+TERMS: dict[str, type[Any]] = {term.__name__: term for term in (Occupancy, Distance, Occlusion, Effort, Gathered, Ring)}
 """The library's terms by name, for files."""
 
 

@@ -11,7 +11,7 @@ from shepherd_phys.bodies import Unicycle
 from shepherd_phys.controllers import Policy, load_policy
 from shepherd_phys.controllers.network import Actor, SectorNetwork, input_shape
 from shepherd_phys.controllers.policy_files import Acting, PolicyError
-from shepherd_phys.envs.rewards import SCHEMES, Effort
+from shepherd_phys.envs.rewards import SCHEMES, Effort, Ring
 from shepherd_phys.envs.team import TeamVecEnv
 from shepherd_phys.flock import Reynolds
 from shepherd_phys.imperfections import Imperfections
@@ -377,8 +377,8 @@ def test_a_preset_may_mix_worlds_and_price_effort():
     assert 1 <= drawn.n_flocks <= 3 and drawn.flock == TINY.scenario.flock
     assert preset.scheme()["effort"] == (-2.0, Effort())
     assert preset.but(effort_team=3).scheme()["effort"] == (-2.0, Effort(team=3))
-    assert preset.but(effort_herd=90).scheme()["effort"] == (-2.0, Effort(herd=90))
-    assert preset.scheme()["gathered"][0] == 3.0
+    assert preset.scheme()["gathered"][0] == 3.0 and "ring" not in preset.scheme()
+    assert preset.but(ring=20.0).scheme()["ring"] == (20.0, Ring())
     with pytest.raises(SettingsError, match="effort: the reward has a term of this name already"):
         preset.but(reward={**SCHEMES["wild"], "effort": (-0.5, Effort())})
     assert set(TINY.scheme()) == set(SCHEMES["wild"])

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shepherd_phys.envs import ANY, ORIGINAL, SCHEMES, WILD, ShepherdingEnv
-from shepherd_phys.envs.rewards import Distance, Effort, Gathered, Occlusion, Occupancy
+from shepherd_phys.envs.rewards import Distance, Effort, Gathered, Occlusion, Occupancy, Ring
 from shepherd_phys.flock import Strombom
 from shepherd_phys.lidar import Lidar
 from shepherd_phys.scenario import Scenario
@@ -43,6 +43,23 @@ def test_gathered_pays_once_nearly_all_are_in():
         Gathered(fraction=1.5)
 
 
+def test_a_ring_pays_three_who_stand_on_it_while_the_herd_is_home():
+    team = FOUR.but(shepherds=3)
+    home = [[0, 0], [2.5, 0], [0, 5.5], [0, 2]]  # one sheep 3 m outside the border
+    _, state = arranged(team, home, [[10.4, 0], [0, -8], [-12.5, 0]])  # on it, 1 m within it, 2 m outside it
+    assert Ring().shares(state, state, None, team) == pytest.approx([0.1, 0.075, 0.05], rel=1e-12)
+    assert Ring()(state, state, None, team) == pytest.approx(0.075, rel=1e-12)
+    assert Ring(fade=1.5).shares(state, state, None, team) == pytest.approx([0.1, 0.1 / 3, 0.0], rel=1e-12)
+    assert Ring(inner=8.0, outer=12.5)(state, state, None, team) == pytest.approx(0.1, rel=1e-12)
+    assert Ring(home=2.9).shares(state, state, None, team) == pytest.approx([0.0] * 3)  # that sheep is not home
+    assert Ring(team=4)(state, state, None, team) == pytest.approx(0.1, rel=1e-12)  # three are too few to stand there
+    assert Ring(team=4, home=2.9)(state, state, None, team) == 0.0
+    _, nobody = arranged(FOUR.but(shepherds=0), home, np.zeros((0, 2)))
+    assert Ring(team=1)(nobody, nobody, None, FOUR) == 0.0
+    with pytest.raises(SettingsError, match=r"Ring: outer: must be at least inner, 9.0 \(given: 8"):
+        Ring(outer=8.0)
+
+
 @pytest.mark.parametrize(("norm", "divisor"), [("NT", 40), ("T", 10), ("none", 1)])
 def test_distance_by_hand(norm, divisor):
     _, state = arranged(FOUR, [[0, 0], [3.5, 0], [0, -4.5], [3, 4]], [[20, 0], [-20, 0]])
@@ -67,9 +84,6 @@ def test_effort_is_the_path_over_that_of_running_all_the_time():
     start = WorldState.of({**vars(env.state), "shepherd_path": np.zeros(2)})
     for team, price in ((1, 1.0), (2, 1.0), (3, 2 / 3), (8, 0.25)):  # two of them are a small team for the last two
         assert Effort(team=team).shares(start, env.state, None, scenario) == pytest.approx(price * own, rel=1e-12)
-    assert scenario.n_sheep == 4
-    for herd, price in ((9, 1.0), (4, 1.0), (3, 9 / 16), (1, 1 / 16)):
-        assert Effort(herd=herd).shares(start, env.state, None, scenario) == pytest.approx(price * own, rel=1e-12)
     nobody = WorldState.of({**vars(env.state), "shepherd_path": np.zeros(0), "shepherd_max_speed": np.zeros(0)})
     assert effort(nobody, nobody, None, scenario) == 0.0
 

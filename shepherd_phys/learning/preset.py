@@ -25,6 +25,7 @@ from shepherd_phys.envs.rewards import (
     Effort,
     Gathered,
     Occlusion,
+    Ring,
     Scheme,
     Term,
     checked,
@@ -64,10 +65,10 @@ class Preset(Settings):
     """Weight of the cost of walking; 0: none."""
     effort_team: int = Field(default=1, ge=1, le=1000)
     """Smallest team that pays it in full; see `shepherd_phys.envs.rewards.Effort`."""
-    effort_herd: int | None = Field(default=None, ge=1)
-    """Largest herd for which it is paid in full; none: all. See `shepherd_phys.envs.rewards.Effort`."""
     gathered: float = Field(default=0.0, ge=0)
     """Weight of what is paid for while the herd is in the goal, all but a few; 0: nothing."""
+    ring: float = Field(default=0.0, ge=0)
+    """Weight of what is paid for standing on a ring about the goal while the herd is home; 0: nothing."""
     alpha: float | None = Field(default=None, ge=0)
     """Least useful distance of the occlusion term [m]; none: the scheme's."""
     rest: float = Field(default=0.0, ge=0, lt=1)
@@ -135,7 +136,7 @@ class Preset(Settings):
         for name, (_, term) in self._terms().items():
             if not (callable(term) or isinstance(term, Foreign)):
                 raise ValueError(f"reward[{name!r}]: needs a term that can be called (given: {term!r})")
-        for name in ("effort", "gathered"):
+        for name in ("effort", "gathered", "ring"):
             if getattr(self, name) and name in self._terms():
                 raise ValueError(f"{name}: the reward has a term of this name already; rename it, or give {name} = 0")
         for name in self.scenarios:
@@ -272,9 +273,11 @@ class Preset(Settings):
                 if isinstance(term, Occlusion):
                     scheme[name] = (weight, term.but(alpha=self.alpha))
         if self.effort:
-            scheme["effort"] = (-self.effort, Effort(team=self.effort_team, herd=self.effort_herd))
+            scheme["effort"] = (-self.effort, Effort(team=self.effort_team))
         if self.gathered:
             scheme["gathered"] = (self.gathered, Gathered())
+        if self.ring:
+            scheme["ring"] = (self.ring, Ring())
         return scheme
 
     def acting(self) -> Acting:
