@@ -171,7 +171,7 @@ class Ring(Settings):
     does not fall in.
     """
 
-    inner: float = Field(default=9.0, gt=0)
+    inner: float = Field(default=9.75, gt=0)
     """Nearest place that is paid in full [m], from the goal's centre."""
     outer: float = Field(default=10.5, gt=0)
     """Furthest place that is paid in full [m]."""

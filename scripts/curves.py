@@ -218,8 +218,14 @@ def _value(name: str, text: str) -> Any:
     return int(text) if name in COUNTS else float(text)
 
 
-def gather(runs: Sequence[Run], folder: Path) -> tuple[list[Row], list[Row]]:
+def gather(runs: Sequence[Run], folder: Path, stretch: int = 0) -> tuple[list[Row], list[Row]]:
     """The curves and the validations of runs, as long as they are here: a folder may hold a longer run.
+
+    Args:
+        runs: of the study.
+        folder: that holds theirs.
+        stretch: shepherd-steps, about, over which neighbouring rollouts are averaged, so that runs whose rollouts
+            differ in length can be compared; 0: no more than `MOST_ROWS` asks for.
 
     Returns:
         rows with the columns `COLUMNS`, those in which whole episodes ended and the last of each run; rows with the
@@ -243,7 +249,10 @@ def gather(runs: Sequence[Run], folder: Path) -> tuple[list[Row], list[Row]]:
             if row["shepherd_steps"] in taken
         ]
     longest = {run.recipe: max(len(rows) for r, rows in found if r.recipe == run.recipe) for run, _ in found}
-    curves = [row for run, rows in found for row in binned(rows, math.ceil(longest[run.recipe] / MOST_ROWS))]
+    curves = []
+    for run, rows in found:
+        width = max(math.ceil(longest[run.recipe] / MOST_ROWS), round(stretch / run.preset.rollout_steps))
+        curves += binned(rows, width)
     return curves, validations
 
 

@@ -64,21 +64,25 @@ def draw_figure1(curves: Sequence[Row], validations: Sequence[Row]) -> bytes:
 def draw_ablations(curves: Sequence[Row]) -> bytes:
     """The ablations as PNG: percent of the sheep in at the end of training episodes, mean over seeds.
 
+    Variants of the preset `paper` on the right, those of `fast` on the left.
+
     Args:
         curves: rows of ``ablations.csv``.
     """
+    recipes = list(dict.fromkeys((row["recipe"], row["reward"]) for row in curves))
     with picture() as drawn:
-        axes = drawn.figure.subplots()
-        for (recipe, reward), (color, style) in zip(
-            dict.fromkeys((row["recipe"], row["reward"]) for row in curves), itertools.cycle(LINES), strict=False
+        panels = drawn.figure.subplots(1, 2, sharex=True)
+        for axes, from_paper, title in zip(
+            panels, (False, True), ("(a) fast, less one ingredient", "(b) paper, one added after another"), strict=True
         ):
-            curve = curve_of(curves, recipe, reward, "in_goal_end")
-            line(axes, curve.steps, curve.values, color, style, recipe, band=False)
-        axes.set_title("sheep in the goal at the end of training episodes, %", fontsize=10, loc="left")
-        axes.set_ylim(-4.0, 104.0)
-        drawn.figure.legend(
-            *axes.get_legend_handles_labels(), loc="outside right center", ncols=1, frameon=False, fontsize=9
-        )
+            own = [scheme for scheme in recipes if scheme[0].startswith("paper") == from_paper]
+            for (recipe, reward), (color, style) in zip(own, itertools.cycle(LINES), strict=False):
+                curve = curve_of(curves, recipe, reward, "in_goal_end")
+                line(axes, curve.steps, curve.values, color, style, recipe, band=False)
+            axes.set_title(f"{title}: sheep in, %", fontsize=10, loc="left")
+            axes.set_ylim(-4.0, 104.0)
+            if own:
+                axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), frameon=False, fontsize=9)
     return drawn.content
 
 

@@ -14,6 +14,8 @@ Scheme = tuple[str, str]
 """(recipe, reward)."""
 TIMED_SCHEME = ("fast", "wild")
 """The scheme of whose runs the time to home is told."""
+STRETCH = 100_000
+"""Shepherd-steps of an evaluation of the ablations, about: their rollouts differ in length."""
 HALF = 50.0
 """Sheep in at the end of training episodes that count as a beginning [%]."""
 
@@ -114,7 +116,7 @@ def ablations_page(curves: Sequence[Row], validations: Sequence[Row]) -> str:
     """
     flocks = _flocks(validations)
     head = ["variant", "seeds", "M shepherd-steps", "decisions", *map(_flocks_word, flocks), "final reward",
-            "half in at", "rate"]  # fmt: skip
+            "half in at"]  # fmt: skip
     lines = [
         "# Ablations: what each ingredient buys",
         "",
@@ -122,8 +124,9 @@ def ablations_page(curves: Sequence[Row], validations: Sequence[Row]) -> str:
         "",
         "Made by `shepherd-phys reproduce`. Of each variant, over its seeds: sheep in the goal at the end of "
         "validation episodes after training, %, mean (least to most); the mean reward of training episodes over the "
-        f"last {WINDOW} evaluations (rollouts); M shepherd-steps when training episodes first ended with half of the "
-        "sheep in; shepherd-steps a second of one process, as many runs at a time as there were workers.",
+        f"last {WINDOW} evaluations, each of the rollouts of about {STRETCH / 1e6:g} M shepherd-steps; M "
+        "shepherd-steps at the first evaluation whose episodes ended with half of the sheep in. Runs beside one "
+        "another take each other's time: none is told.",
         "",
         line(head),
         line(["---", *["---:"] * (len(head) - 1)]),
@@ -141,7 +144,6 @@ def ablations_page(curves: Sequence[Row], validations: Sequence[Row]) -> str:
                     *(_spread(at_end.get(k, [])) for k in flocks),
                     _number(final_value(curve_of(curves, recipe, reward)), ".2f"),
                     _half_in(curves, recipe, reward),
-                    _rate(lasts),
                 ]
             )
         )
@@ -213,7 +215,8 @@ def _mean(values: Sequence[float]) -> float | None:
 
 def _spread(values: Sequence[float]) -> str:
     mean = _mean(values)
-    return "" if mean is None else f"{mean:.1f} ({min(values):.1f} to {max(values):.1f})"
+    spread = f" ({min(values):.1f} to {max(values):.1f})" if len(values) > 1 else ""
+    return "" if mean is None else f"{mean:.1f}{spread}"
 
 
 def _number(value: float | None, digits: str) -> str:

@@ -22,7 +22,7 @@ from shepherd_phys.settings import SettingsError
 
 from .campaigns import lost, opened
 from .curves import VALIDATIONS, Row, gather, home_at, one_by_one, read_rows, side_by_side, unfinished
-from .learning_pages import ablations_page, figure1_page
+from .learning_pages import STRETCH, ablations_page, figure1_page
 from .pages import claims_page
 from .points import points, tasks
 from .train import check_libraries
@@ -137,7 +137,7 @@ def ablations(folder: Path, *, n_seeds: int, budget: int, workers: int) -> Resul
     runs = [run for run in runs if run not in [failure.run for failure in failed]]
     if not runs:
         return Result({}, "", [], [str(failure) for failure in failed])
-    curves, validations = gather(runs, training)
+    curves, validations = gather(runs, training, STRETCH)
     order = {run.recipe: None for run in runs}
     curves.sort(key=lambda row: list(order).index(row["recipe"]))  # variant by variant, each seed after seed
     validations.sort(key=lambda row: list(order).index(row["recipe"]))

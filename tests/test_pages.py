@@ -165,4 +165,6 @@ def test_the_guide_shows_what_is_committed():
     page = (REPRODUCTION.parent / "reproducing.md").read_text("utf-8")
     committed = {path.name for path in REPRODUCTION.glob("*")}
     assert {name for name in FILES if f"](reproduction/{name})" in page} == committed & set(LINKED)
-    assert committed <= set(FILES)
+    assert committed <= {*FILES, "training"}
+    kept = {"preset.toml", "curve.csv", "validation.csv", "first.json", "first.safetensors"}
+    assert {path.name for path in REPRODUCTION.glob("training/*/*")} <= kept

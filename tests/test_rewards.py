@@ -46,7 +46,7 @@ def test_gathered_pays_once_nearly_all_are_in():
 def test_a_ring_pays_three_who_stand_on_it_while_the_herd_is_home():
     team = FOUR.but(shepherds=3)
     home = [[0, 0], [2.5, 0], [0, 5.5], [0, 2]]  # one sheep 3 m outside the border
-    _, state = arranged(team, home, [[10.4, 0], [0, -8], [-12.5, 0]])  # on it, 1 m within it, 2 m outside it
+    _, state = arranged(team, home, [[10.4, 0], [0, -8.75], [-12.5, 0]])  # on it, 1 m within it, 2 m outside it
     assert Ring().shares(state, state, None, team) == pytest.approx([0.1, 0.075, 0.05], rel=1e-12)
     assert Ring()(state, state, None, team) == pytest.approx(0.075, rel=1e-12)
     assert Ring(fade=1.5).shares(state, state, None, team) == pytest.approx([0.1, 0.1 / 3, 0.0], rel=1e-12)
@@ -56,7 +56,7 @@ def test_a_ring_pays_three_who_stand_on_it_while_the_herd_is_home():
     assert Ring(team=4, home=2.9)(state, state, None, team) == 0.0
     _, nobody = arranged(FOUR.but(shepherds=0), home, np.zeros((0, 2)))
     assert Ring(team=1)(nobody, nobody, None, FOUR) == 0.0
-    with pytest.raises(SettingsError, match=r"Ring: outer: must be at least inner, 9.0 \(given: 8"):
+    with pytest.raises(SettingsError, match=r"Ring: outer: must be at least inner, 9.75 \(given: 8"):
         Ring(outer=8.0)
 
 

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 import os
 import shutil
 import subprocess
@@ -17,7 +18,7 @@ from shepherd_phys.controllers.curves import COLUMNS
 from shepherd_phys.learning import studies
 from shepherd_phys.learning.studies import Run
 from shepherd_phys.scripts import main, reproduce, train
-from shepherd_phys.scripts.curves import VALIDATIONS, one_by_one, read_rows
+from shepherd_phys.scripts.curves import VALIDATIONS, gather, one_by_one, read_rows
 from shepherd_phys.scripts.learning_pages import ablations_page, figure1_page
 from shepherd_phys.scripts.studies import HOME_COLUMNS, Reported
 from shepherd_phys.scripts.studies import figure1 as study
@@ -331,6 +332,13 @@ def test_the_ablations_one_after_another(folder, capsys, monkeypatch):
     assert main.main([*ABLATIONS, "--workers", "1"]) == 0
     said = capsys.readouterr()
     check_ablations(Path("o"), said.out, said.err)
+    training = Path("o/training")
+    wanted = studies.ablations(1, 300)
+    (each, _), (pairs, _) = gather(wanted, training), gather(wanted, training, 2 * QUICK.rollout_steps)
+    one, both = ([row for row in rows if row["recipe"] == "base"] for rows in (each, pairs))
+    assert (len(one), len(both)) == (len(one), math.ceil(len(one) / 2))
+    assert both[0]["episode_reward"] == sum(row["episode_reward"] for row in one[:2]) / 2
+    assert both[0]["shepherd_steps"] == one[1]["shepherd_steps"]
 
 
 @pytest.mark.slow
