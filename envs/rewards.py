@@ -25,7 +25,7 @@ from pydantic import Field
 
 from shepherd_phys.lidar import CHANNELS, Lidar, Scan
 from shepherd_phys.scenario import SUCCESS_FRACTION, Scenario
-from shepherd_phys.settings import Foreign, Settings, SettingsError, handed_over, settings, tagged, untagged
+from shepherd_phys.settings import Foreign, Settings, SettingsError, check_call, handed_over, settings, tagged, untagged
 from shepherd_phys.state import Floats, WorldState
 from shepherd_phys.world import SHEEP_SETS, NonFiniteError
 
@@ -164,38 +164,38 @@ class Gathered(Settings):
 
 @settings
 class Ring(Settings):
-    """While the herd is home, mean over the shepherds of their nearness to a ring about the goal, over T: 1 at most.
+    """While the herd is home, mean over the shepherds of how far each stands off a ring about the goal, over T.
 
-    In none of the paper's schemes. Three or more who stand on such a ring press a herd in from all sides and hold it
-    (as the tuned heuristics do); nearer they drive it out, and from further off a large herd lies about the goal and
-    does not fall in.
+    It is in [0, 1 / T], and 1 at most over an episode.
+
+    What it costs to stand wrong, so its weight is negative; in none of the paper's schemes. Three or more who stand on
+    such a ring press a herd in from all sides and hold it (as the tuned heuristics do); nearer they drive it out, and
+    from further off a large herd lies about the goal and does not fall in.
     """
 
     inner: float = Field(default=9.75, gt=0)
-    """Nearest place that is paid in full [m], from the goal's centre."""
+    """Nearest place on the ring [m], from the goal's centre."""
     outer: float = Field(default=10.5, gt=0)
-    """Furthest place that is paid in full [m]."""
+    """Furthest place on the ring [m]."""
     fade: float = Field(default=4.0, gt=0)
-    """So far from the ring nothing is paid [m]."""
+    """So far off the ring the term is 1, and no more further on [m]."""
     home: float = Field(default=3.0, gt=0)
     """The herd is home when no sheep is further outside the goal's border [m]."""
     team: int = Field(default=3, ge=1, le=1000)
-    """Shepherds of the smallest team that has to stand there. Fewer would drive the herd out on the far side: they are
-    paid in full wherever they stand."""
+    """Shepherds of the smallest team that has to stand there. Fewer would drive the herd out on the far side: for them
+    the term is 0."""
 
     def __post_init__(self) -> None:
         if self.outer < self.inner:
             raise ValueError(f"outer: must be at least inner, {self.inner} (given: {self.outer})")
 
     def shares(self, before: WorldState, after: WorldState, scan: Scan | None, scenario: Scenario) -> Floats:
-        """(P,) each shepherd's nearness, over T."""
-        if after.sheep_goal_distance.max() > self.home:
+        """(P,) how far each stands off the ring, over ``fade`` T."""
+        if after.n_shepherds < self.team or after.sheep_goal_distance.max() > self.home:
             return np.zeros(after.n_shepherds)
-        if after.n_shepherds < self.team:
-            return np.full(after.n_shepherds, 1.0 / scenario.n_steps)
         away = np.hypot(*(after.shepherd_pos - after.goal_pos).T)
         off = np.maximum(self.inner - away, away - self.outer)
-        return np.asarray(np.clip(1.0 - off / self.fade, 0.0, 1.0) / scenario.n_steps)
+        return np.asarray(np.clip(off / self.fade, 0.0, 1.0) / scenario.n_steps)
 
     def __call__(self, before: WorldState, after: WorldState, scan: Scan | None, scenario: Scenario) -> float:
         """Mean of the shares, 0 where there is no shepherd."""
@@ -227,12 +227,17 @@ def checked(rewards: Scheme | str) -> Scheme:
         if rewards not in SCHEMES:
             raise SettingsError(f"rewards: {rewards!r} is not one of {', '.join(SCHEMES)}")
         return SCHEMES[rewards]
-    try:
-        scheme = {str(name): (float(weight), term) for name, (weight, term) in rewards.items()}
-    except (AttributeError, TypeError, ValueError):
-        raise SettingsError(
-            f"rewards: needs a scheme's name or a mapping name -> (weight, term) (given: {rewards!r})"
-        ) from None
+    if not isinstance(rewards, Mapping):
+        raise SettingsError(f"rewards: needs a scheme's name or a mapping name -> (weight, term) (given: {rewards!r})")
+    scheme = {}
+    for name, pair in rewards.items():
+        try:
+            weight, term = pair
+            scheme[str(name)] = (float(weight), term)
+        except (TypeError, ValueError):
+            raise SettingsError(
+                f"rewards[{name!r}]: needs a number and a term, (weight, term) (given: {pair!r})"
+            ) from None
     for name, (weight, term) in scheme.items():
         if isinstance(term, Foreign):
             raise term.missing()
@@ -240,6 +245,7 @@ def checked(rewards: Scheme | str) -> Scheme:
             raise SettingsError(
                 f"rewards[{name!r}]: needs a finite weight and a callable term (given: {weight}, {term!r})"
             )
+        check_call(term, ("before", "after", "scan", "scenario"), f"rewards[{name!r}]")
     return scheme
 
 

@@ -18,7 +18,7 @@ from shepherd_phys.envs.rewards import Scheme, checked, earned, scans_for
 from shepherd_phys.flock import FLOCKS, FlockModel
 from shepherd_phys.lidar import Lidar
 from shepherd_phys.scenario import Scenario, load_scenario
-from shepherd_phys.settings import SettingsError, kind_of, meant
+from shepherd_phys.settings import SettingsError, check_call, kind_of, meant
 from shepherd_phys.workers import explain
 from shepherd_phys.world import World
 
@@ -47,6 +47,7 @@ def find_scenario(name: str, classes: Iterable[type[Any]] = ()) -> Scenario:
         return load_scenario(name, classes)
     own = imported(name, "scenario")
     if inspect.isroutine(own):
+        check_call(own, (), f"scenario: {name}")
         try:
             own = own()
         except SettingsError:
@@ -54,7 +55,7 @@ def find_scenario(name: str, classes: Iterable[type[Any]] = ()) -> Scenario:
         except Exception as error:
             raise SettingsError(f"scenario: {name}: cannot be made: {explain(error)}") from None
     if not isinstance(own, Scenario):
-        raise SettingsError(f"scenario: {name}: needs a Scenario (it is a {type(own).__name__})")
+        raise SettingsError(f"scenario: {name}: needs a Scenario (given: {own!r})")
     return own
 
 
@@ -203,7 +204,7 @@ def _made(cls: type[Any], protocol: type[Any], where: str) -> Any:
         made = cls()
     except TypeError as error:
         raise SettingsError(
-            f"{where}: cannot be made without arguments ({error}); a scenario file can give them"
+            f"{where}: cannot be made without arguments ({error}); a dataclass can be given them in a scenario file"
         ) from None
     except SettingsError:
         raise

@@ -91,6 +91,13 @@ def main(argv: Sequence[str]) -> int:
     from shepherd_phys.learning.validation import ValidationError
     from shepherd_phys.workers import WorkersError
 
+    interval = preset.checkpoint_rollouts * preset.rollout_steps
+    if preset.budget < interval:
+        print(
+            f"the budget of {preset.budget:,} shepherd-steps is less than a checkpoint interval, with which runs end: "
+            f"{interval:,} are trained (checkpoint_rollouts in a preset of your own)",
+            file=sys.stderr,
+        )
     print(
         f"{folder}: {preset.worlds} worlds, {preset.n_slots} shepherds, {preset.n_rollouts:,} rollouts of "
         f"{preset.rollout_steps:,} shepherd-steps",
@@ -179,7 +186,11 @@ def asked(preset: Preset, options: Train, given: set[str], kinds: Mapping[str, A
     if options.obstacles is not None or options.density is not None:
         layout = preset.scenario.layout or Scattered(count=0)
         if not isinstance(layout, Scattered):
-            raise SettingsError(f"--obstacles, --density: the scenario has a layout of its own, {kind_of(layout)}")
+            given_flag = "--obstacles" if options.obstacles is not None else "--density"
+            raise SettingsError(
+                f"{given_flag}: scatters discs, and the scenario has a layout of its own, {kind_of(layout)}; give one "
+                "or the other"
+            )
         layout = layout.but(count=options.obstacles, density=options.density)
         drawn = preset.density
         if drawn is not None and options.density is None:

@@ -191,7 +191,11 @@ def laid_out(layout: Layout, rng: np.random.Generator, site: Site) -> tuple[tupl
             drawn = tuple(answer)
         except TypeError:
             raise SettingsError(f"{name}: needs to give obstacles (given: {answer!r})") from None
-        gap = surfaces(drawn).static_distances(site.goal_pos[None])[0].min(initial=math.inf) - site.goal_radius
+        try:
+            shapes = surfaces(drawn)
+        except SettingsError as error:
+            raise SettingsError(f"{name} drew {error}") from None
+        gap = shapes.static_distances(site.goal_pos[None])[0].min(initial=math.inf) - site.goal_radius
         if gap < site.goal_keep_out - CLEARANCE:
             raise PlacementError(
                 f"{name}: an obstacle is {gap:.3g} m from the goal's border; at least {site.goal_keep_out:g} m are "

@@ -10,7 +10,7 @@ import dataclasses
 import difflib
 import inspect
 import tomllib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self, TypeVar, cast, dataclass_transform
 
@@ -167,6 +167,27 @@ class Foreign:
             "an obstacle or a layout of one's own, or several bodies, is itself given as --scenario module:Name, and a "
             "reward of one's own as --reward module:Name"
         )
+
+
+def check_call(thing: Callable[..., Any], arguments: Sequence[str], where: str) -> None:
+    """Find out whether something can be called as it is going to be.
+
+    Args:
+        thing: a function or method, a user's own perhaps; one that does not tell its parameters is trusted.
+        arguments: names of those that it is given, in their order.
+        where: what it is, for the error.
+
+    Raises:
+        SettingsError: it takes other arguments.
+    """
+    try:
+        taken = inspect.signature(thing)
+    except (TypeError, ValueError):
+        return
+    try:
+        taken.bind(*arguments)
+    except TypeError:
+        raise SettingsError(f"{where}: is called with ({', '.join(arguments)}); this one takes {taken}") from None
 
 
 def kind_of(value: object) -> str:

@@ -20,7 +20,7 @@ from shepherd_phys.geometry import SHEEP
 from shepherd_phys.imperfections import disturbed
 from shepherd_phys.lidar import Lidar, Scan, Sensor
 from shepherd_phys.scenario import Scenario
-from shepherd_phys.settings import Foreign, SettingsError, kind_of
+from shepherd_phys.settings import Foreign, SettingsError, check_call, kind_of
 from shepherd_phys.stage import Stage, Streams
 from shepherd_phys.state import Floats, WorldState, frozen
 
@@ -62,6 +62,12 @@ class World:
         self._flock = kind_of(scenario.flock)  # for errors
         if not callable(self._velocities):
             raise SettingsError(f"flock ({self._flock}): needs 'velocities', or to be a function like it")
+        check_call(self._velocities, ("state", "rng"), f"flock ({self._flock})")
+        for kind, body in {kind_of(body): body for body in (*scenario.shepherds, *scenario.sheep_kinds)}.items():
+            if hasattr(body, "follow"):
+                check_call(body.follow, ("pose", "wanted", "dt"), f"{kind}.follow")
+        if callable(scenario.layout):
+            check_call(scenario.layout, ("rng", "site"), f"layout ({kind_of(scenario.layout)})")
         self.scenario = scenario
         self._h, self._substeps = scenario.physics_dt, scenario.n_substeps
         self._n = scenario.n_sheep

@@ -378,7 +378,7 @@ def test_a_preset_may_mix_worlds_and_price_effort():
     assert preset.scheme()["effort"] == (-2.0, Effort())
     assert preset.but(effort_team=3).scheme()["effort"] == (-2.0, Effort(team=3))
     assert preset.scheme()["gathered"][0] == 3.0 and "ring" not in preset.scheme()
-    assert preset.but(ring=20.0).scheme()["ring"] == (20.0, Ring())
+    assert preset.but(ring=20.0).scheme()["ring"] == (-20.0, Ring())
     with pytest.raises(SettingsError, match="effort: the reward has a term of this name already"):
         preset.but(reward={**SCHEMES["wild"], "effort": (-0.5, Effort())})
     assert set(TINY.scheme()) == set(SCHEMES["wild"])

@@ -43,17 +43,16 @@ def test_gathered_pays_once_nearly_all_are_in():
         Gathered(fraction=1.5)
 
 
-def test_a_ring_pays_three_who_stand_on_it_while_the_herd_is_home():
+def test_standing_off_the_ring_counts_for_three_while_the_herd_is_home():
     team = FOUR.but(shepherds=3)
     home = [[0, 0], [2.5, 0], [0, 5.5], [0, 2]]  # one sheep 3 m outside the border
     _, state = arranged(team, home, [[10.4, 0], [0, -8.75], [-12.5, 0]])  # on it, 1 m within it, 2 m outside it
-    assert Ring().shares(state, state, None, team) == pytest.approx([0.1, 0.075, 0.05], rel=1e-12)
-    assert Ring()(state, state, None, team) == pytest.approx(0.075, rel=1e-12)
-    assert Ring(fade=1.5).shares(state, state, None, team) == pytest.approx([0.1, 0.1 / 3, 0.0], rel=1e-12)
-    assert Ring(inner=8.0, outer=12.5)(state, state, None, team) == pytest.approx(0.1, rel=1e-12)
-    assert Ring(home=2.9).shares(state, state, None, team) == pytest.approx([0.0] * 3)  # that sheep is not home
-    assert Ring(team=4)(state, state, None, team) == pytest.approx(0.1, rel=1e-12)  # three are too few to stand there
-    assert Ring(team=4, home=2.9)(state, state, None, team) == 0.0
+    assert Ring().shares(state, state, None, team) == pytest.approx([0.0, 0.025, 0.05], rel=1e-12)
+    assert Ring()(state, state, None, team) == pytest.approx(0.025, rel=1e-12)
+    assert Ring(fade=1.5).shares(state, state, None, team) == pytest.approx([0.0, 0.1 / 1.5, 0.1], rel=1e-12)
+    assert Ring(inner=8.0, outer=12.5)(state, state, None, team) == 0.0
+    assert Ring(home=2.9)(state, state, None, team) == 0.0  # that sheep is not home
+    assert Ring(team=4)(state, state, None, team) == 0.0  # three are too few
     _, nobody = arranged(FOUR.but(shepherds=0), home, np.zeros((0, 2)))
     assert Ring(team=1)(nobody, nobody, None, FOUR) == 0.0
     with pytest.raises(SettingsError, match=r"Ring: outer: must be at least inner, 9.75 \(given: 8"):
@@ -219,7 +218,12 @@ def test_users_add_terms():
     ("rewards", "message"),
     [
         ("wool", "rewards: 'wool' is not one of original, any, wild"),
-        ({"a": 3}, "mapping name -> "),
+        ({"a": 3}, r"rewards\['a'\]: needs a number and a term, \(weight, term\) \(given: 3\)"),
+        ({"a": ("x", Occupancy())}, r"rewards\['a'\]: needs a number and a term"),
+        (
+            {"a": (1.0, lambda before, after: 0.0)},
+            r"rewards\['a'\]: is called with \(before, after, scan, scenario\); this one takes \(before, after\)",
+        ),
         ({"a": (math.nan, Occupancy())}, r"rewards\['a'\]: needs a finite weight"),
         ({"a": (1.0, 7)}, r"rewards\['a'\]: needs a finite weight and a callable term"),
         (5, "needs a scheme's name or a mapping"),

@@ -133,6 +133,15 @@ class Lost(Free):
 class Wild:
     def __init__(self): raise RuntimeError("too wild")
 def maker(): raise KeyError("no")
+def ask(n): return None
+def cold(state): return 0.0 * state.sheep_pos
+def strewn():
+    from shepherd_phys.scenario import Scenario
+    return Scenario(n_sheep=6, layout=lambda rng: [])
+def junk():
+    from shepherd_phys.scenario import Scenario
+    return Scenario(n_sheep=6, layout=litter)
+def litter(rng, site): return [1, 2]
 number = 3
 """
 
@@ -591,8 +600,12 @@ MISTAKES = [
     ("--shard 0/3", "shard: '0/3' is impossible; it must be I/N"),
     ("--shard 4/3", "shard: '4/3' is impossible; it must be I/N"),
     ("--shard half", "shard: 'half' is impossible; it must be I/N"),
-    ("--scenario mine:number", "scenario: mine:number: needs a Scenario (it is a int)"),
+    ("--scenario mine:number", "scenario: mine:number: needs a Scenario (given: 3)"),
     ("--scenario mine:maker", "scenario: mine:maker: cannot be made: KeyError: 'no' (mine.py:"),
+    ("--scenario mine:ask", "scenario: mine:ask: is called with (); this one takes (n)"),
+    ("--scenario mine:strewn", "): is called with (rng, site); this one takes (rng)"),
+    ("--scenario mine:junk", "layout (mine:litter) drew obstacles[0] (builtins:int): an obstacle needs 'shapes'"),
+    ("--flock mine:cold", "flock (mine:cold): is called with (state, rng); this one takes (state)"),
     ("--scenario nowhere", "scenario: 'nowhere' is neither a .toml file nor one of paper"),
     ("--scenario nowhere.toml", "nowhere.toml: cannot be read (No such file or directory)"),
     ("--scenario bad.toml", "bad.toml: is not a TOML file"),
@@ -613,9 +626,9 @@ MISTAKES = [
     ("--scenario herd.toml --body mine:Cart", "'mine:Crowd' is a class of somebody's own and was not handed over"),
     ("--scenario herd.toml --flock mine:Crowd", "--body module:Name hands over a body and --flock"),
     ("--scenario post.toml", "an obstacle or a layout of one's own, or several bodies, is itself given"),
-    ("--scenario mine:Chase", "scenario: mine:Chase: needs a Scenario (it is a type)"),
+    ("--scenario mine:Chase", "scenario: mine:Chase: needs a Scenario (given: <class"),
     ("--scenario mine:Nobody", "scenario: mine:Nobody: module 'mine' has no 'Nobody'"),
-    ("--body mine:Stuck", "TypeError: Stuck.follow() takes 3 positional arguments but 4 were given"),
+    ("--body mine:Stuck", "mine:Stuck.follow: is called with (pose, wanted, dt); this one takes (pose, wanted)"),
     ("--body mine:Dizzy", "Dizzy.follow: velocity and spin must be finite"),
     ("--flock mine:Lost", "flock model (mine:Lost): velocities need shape (6, 2) (given: (2,))"),
     ("--scenario broken.toml --body mine:Cart", "Scenario.shepherds[0]: mine:Cart: a cart has a size"),

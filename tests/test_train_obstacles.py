@@ -89,7 +89,10 @@ def test_a_density_that_is_asked_for_is_drawn_instead_of_the_presets():
     ("words", "message"),
     [
         ("--obstacles 3 --density 0.1", "--obstacles and --density: both say how many obstacles there are"),
-        ("--scenario fence --obstacles 3", "--obstacles, --density: the scenario has a layout of its own, Fenced"),
+        (
+            "--scenario fence --obstacles 3",
+            "--obstacles: scatters discs, and the scenario has a layout of its own, Fenced; give one or the other",
+        ),
         ("--preset collie-obstacles --obstacles 3", "--obstacles: the preset draws another density for each episode"),
         ("--obstacles -1", "obstacles: -1 is impossible; it must be at least 0"),
         ("--obstacles many", "--obstacles takes a whole number"),

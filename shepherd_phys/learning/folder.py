@@ -143,11 +143,11 @@ class Table:
                 rows = list(csv.reader(file))[1:]
         kept = [row for row in rows if len(row) == len(columns) and row[0].isdecimal() and int(row[0]) <= last]
         with whole_file(path) as part, open(part, "w", newline="", encoding="utf-8") as file:
-            csv.writer(file).writerows([list(columns), *kept])
+            csv.writer(file, lineterminator="\n").writerows([list(columns), *kept])
 
     def add(self, row: Mapping[str, Any]) -> None:
         """Append a row; what is NaN or missing stays empty."""
         cells = [row.get(name) for name in self._columns]
         cells = ["" if cell is None or (isinstance(cell, float) and math.isnan(cell)) else cell for cell in cells]
         with open(self._path, "a", newline="", encoding="utf-8") as file:
-            csv.writer(file).writerow(cells)
+            csv.writer(file, lineterminator="\n").writerow(cells)

@@ -68,7 +68,8 @@ class Preset(Settings):
     gathered: float = Field(default=0.0, ge=0)
     """Weight of what is paid for while the herd is in the goal, all but a few; 0: nothing."""
     ring: float = Field(default=0.0, ge=0)
-    """Weight of what is paid for standing on a ring about the goal while the herd is home; 0: nothing."""
+    """Weight of the cost of standing off a ring about the goal while the herd is home; 0: none. See
+    `shepherd_phys.envs.rewards.Ring`."""
     alpha: float | None = Field(default=None, ge=0)
     """Least useful distance of the occlusion term [m]; none: the scheme's."""
     rest: float = Field(default=0.0, ge=0, lt=1)
@@ -277,7 +278,7 @@ class Preset(Settings):
         if self.gathered:
             scheme["gathered"] = (self.gathered, Gathered())
         if self.ring:
-            scheme["ring"] = (self.ring, Ring())
+            scheme["ring"] = (-self.ring, Ring())
         return scheme
 
     def acting(self) -> Acting:
