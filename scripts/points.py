@@ -224,8 +224,8 @@ def strangers(points: Iterable[Point]) -> list[str]:
         ]
         if told and point.controller not in lines:
             lines[point.controller] = (
-                f"{Path(point.controller).name} was trained in another scenario ({', '.join(told)}); this is "
-                f"{point.scenario_name}: --scenario names another"
+                f"{point.controller} was trained in another scenario ({', '.join(told)}); this is "
+                f"{point.scenario_name}: --scenario names another, --body and --flock other bodies and flocks"
             )
     return list(lines.values())
 
