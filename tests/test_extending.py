@@ -181,7 +181,7 @@ FOGGY = SCENARIOS["small"].but(layout=fog)
     ("flags", "message"),
     [
         ("--body my_file:Stone", "body: my_file:Stone: lacks build, follow"),
-        ("--body my_file:Stuck", "my_file:Stuck.follow: is called with (pose, wanted, dt); this one takes (pose, wanted)"),
+        ("--body my_file:Stuck", "my_file:Stuck.follow: is called with (pose, wanted, dt); this one takes ("),
         ("--body my_file:Ghost", "shepherd 0 (my_file:Ghost).build: needs a pymunk.Body and a list of its shapes"),
         ("--body my_file:Bomb", "OSError: no parts (my_file.py:"),
         ("--body my_file:Buoy", "(my_file:Buoy).build: a Circle is a sensor, which touches nothing and no beam sees"),
@@ -189,7 +189,7 @@ FOGGY = SCENARIOS["small"].but(layout=fog)
         ("--scenario my_file:FOGGY", "OSError: no light (my_file.py:"),
         ("--flock my_file:Secretive", "my_file:Secretive: cannot be written, because it does not say"),
         ("--reward my_file:number", "reward: my_file:number: needs a scheme, a dict of name -> (weight, term)"),
-        ("--reward my_file:BLAND", "reward: my_file:BLAND: rewards['bland']: needs a number and a term, (weight, term)"),
+        ("--reward my_file:BLAND", "reward: my_file:BLAND: rewards['bland']: needs a number and a term"),
         ("--reward my_file:SOUR", "OSError: no taste (my_file.py:"),
         ("--reward sweet", "reward: 'sweet' is not one of original, any, wild"),
         ("--body my_file:number", "body: my_file:number: needs a class (it is a int)"),
