@@ -164,9 +164,10 @@ class Gathered(Settings):
 
 @settings
 class Ring(Settings):
-    """While the herd is home, mean over the shepherds of how far each stands off a ring about the goal, over T.
+    """While the herd is home, mean over the shepherds of how far each stands off a ring round the goal, over fade T.
 
-    It is in [0, 1 / T], and 1 at most over an episode.
+    It is in [0, 1 / T], and 1 at most over an episode. The ring does not grow with the goal: sheep feel shepherds from
+    the same distance.
 
     What it costs to stand wrong, so its weight is negative; in none of the paper's schemes. Three or more who stand on
     such a ring press a herd in from all sides and hold it (as the tuned heuristics do); nearer they drive it out, and
@@ -190,7 +191,7 @@ class Ring(Settings):
             raise ValueError(f"outer: must be at least inner, {self.inner} (given: {self.outer})")
 
     def shares(self, before: WorldState, after: WorldState, scan: Scan | None, scenario: Scenario) -> Floats:
-        """(P,) how far each stands off the ring, over ``fade`` T."""
+        """(P,) how far each stands off the ring, over ``fade`` T; 1 / T at most."""
         if after.n_shepherds < self.team or after.sheep_goal_distance.max() > self.home:
             return np.zeros(after.n_shepherds)
         away = np.hypot(*(after.shepherd_pos - after.goal_pos).T)
@@ -234,7 +235,7 @@ def checked(rewards: Scheme | str) -> Scheme:
         try:
             weight, term = pair
             scheme[str(name)] = (float(weight), term)
-        except (TypeError, ValueError):
+        except (OverflowError, TypeError, ValueError):
             raise SettingsError(
                 f"rewards[{name!r}]: needs a number and a term, (weight, term) (given: {pair!r})"
             ) from None
@@ -245,6 +246,8 @@ def checked(rewards: Scheme | str) -> Scheme:
             raise SettingsError(
                 f"rewards[{name!r}]: needs a finite weight and a callable term (given: {weight}, {term!r})"
             )
+        if isinstance(term, type):
+            raise SettingsError(f"rewards[{name!r}]: a class was given; make one of it: {term.__name__}()")
         check_call(term, ("before", "after", "scan", "scenario"), f"rewards[{name!r}]")
     return scheme
 

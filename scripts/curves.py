@@ -18,13 +18,13 @@ from shepherd_phys.learning.folder import (
     CHECKPOINTS,
     CURVE,
     FIRST,
-    LOCK,
     PRESET,
     VALIDATION,
     agree,
     begin,
     ended,
     exported,
+    is_policy_of,
 )
 from shepherd_phys.learning.studies import HOME, Run
 from shepherd_phys.settings import SettingsError
@@ -87,21 +87,21 @@ def _whole(run: Run, place: Path) -> bool:
 def _told(run: Run, place: Path) -> bool:
     """Whether a folder without checkpoints holds all that a study asks of a finished run: it is small enough to keep.
 
-    That is the preset, the curve, the validations to its end and, if it is judged in the end, the first policy that
-    passed. Where somebody trained, there is a lock: its run may have been killed before its first checkpoint.
+    That is the preset, the whole curve, the validations to its end and, of a timed run, the first policy that passed.
     """
-    if (place / LOCK).exists() or not ((place / CURVE).exists() and (place / VALIDATION).exists()):
+    if not ((place / CURVE).exists() and (place / VALIDATION).exists()):
         return False
     rows = read_rows(place / CURVE, ("rollout", "seconds"))
     judged = read_rows(place / VALIDATION, ("checkpoint", "in_goal_end"))
-    if not rows or not judged:
-        return False
-    done, interval = rows[-1]["rollout"], run.preset.checkpoint_rollouts
-    if done % interval or max(row["checkpoint"] for row in judged) != done // interval:
+    done, interval, checks = len(rows), run.preset.checkpoint_rollouts, run.preset.validation
+    if not done or rows[-1]["rollout"] != done or done % interval:
         return False
     if done < run.preset.n_rollouts and rows[-1]["seconds"] < 3600.0 * run.hours:
         return False
-    return not run.timed or (place / FIRST).exists() or home_at(judged) is None
+    n_points = len(checks.flocks) * len(checks.cohesion) * len(checks.shepherds)
+    if sum(row["checkpoint"] == done // interval for row in judged) != n_points:
+        return False
+    return not run.timed or home_at(judged) is None or is_policy_of(place / FIRST)
 
 
 def home_at(rows: Iterable[Row]) -> int | None:

@@ -181,7 +181,9 @@ def check_call(thing: Callable[..., Any], arguments: Sequence[str], where: str) 
         SettingsError: it takes other arguments.
     """
     try:
-        taken = inspect.signature(thing)
+        # what a wrapper of a user's own takes counts, not what it wraps; a compiled function tells only that
+        own = inspect.isfunction(thing) or inspect.ismethod(thing)
+        taken = inspect.signature(thing, follow_wrapped=not own)
     except (TypeError, ValueError):
         return
     try:

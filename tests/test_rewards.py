@@ -1,5 +1,6 @@
 """Reward terms by hand, and against a naive reference on random scenes."""
 
+import functools
 import math
 
 import numpy as np
@@ -220,6 +221,8 @@ def test_users_add_terms():
         ("wool", "rewards: 'wool' is not one of original, any, wild"),
         ({"a": 3}, r"rewards\['a'\]: needs a number and a term, \(weight, term\) \(given: 3\)"),
         ({"a": ("x", Occupancy())}, r"rewards\['a'\]: needs a number and a term"),
+        ({"a": (10**400, Occupancy())}, r"rewards\['a'\]: needs a number and a term"),
+        ({"a": (1.0, Occupancy)}, r"rewards\['a'\]: a class was given; make one of it: Occupancy\(\)"),
         (
             {"a": (1.0, lambda before, after: 0.0)},
             r"rewards\['a'\]: is called with \(before, after, scan, scenario\); this one takes \(before, after\)",
@@ -232,6 +235,21 @@ def test_users_add_terms():
 def test_bad_schemes(rewards, message):
     with pytest.raises(SettingsError, match=message):
         ShepherdingEnv("small", rewards=rewards)
+
+
+def test_a_term_under_a_wrapper_takes_what_the_wrapper_takes():
+    def inner(before, after, scan, scenario, weight):
+        return weight
+
+    @functools.wraps(inner)
+    def wrapped(*given):
+        return inner(*given, 0.5)
+
+    env = ShepherdingEnv("small", rewards={"a": (2.0, wrapped)}, lidar=None)
+    env.reset(seed=1)
+    assert env.step(np.zeros((2, 2)))[1] == 1.0
+    with pytest.raises(SettingsError, match=r"is called with \(before, after, scan, scenario\)"):
+        ShepherdingEnv("small", rewards={"a": (2.0, inner)})
 
 
 def test_a_term_that_wants_an_unknown_scan_is_named():

@@ -213,9 +213,9 @@ def test_a_finished_run_can_be_kept_without_its_checkpoints(folder, capsys, monk
     assert figure1("--paper-hours", "1e-9", budget=720) == 1
     assert again == ["wild-0", "any-0"]  # longer, they are not whole; the paper's run has a time
     again.clear()
-    Path("o/training/wild-0/first.json").unlink()  # which its reported trials need
+    Path("o/training/wild-0/first.safetensors").unlink()  # which its reported trials need
     rows = Path("o/training/any-0/validation.csv").read_text().splitlines()
-    Path("o/training/any-0/validation.csv").write_text("\n".join(rows[:-2]) + "\n")  # the end is not judged
+    Path("o/training/any-0/validation.csv").write_text("\n".join(rows[:-1]) + "\n")  # the end is not judged whole
     Path("o/training/paper-wild-7/curve.csv").unlink()
     assert figure1("--paper-hours", "1e-9") == 1
     assert again == ["wild-0", "any-0", "paper-wild-7"]
