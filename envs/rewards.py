@@ -52,6 +52,11 @@ def _occluding(sheep: Floats, goal: Floats, alpha: float, influence: float, n_st
         shares[p] = count / n_steps
 
 
+def _mean(shares: Floats) -> float:
+    """Mean of the shares (P,), 0 where there is no shepherd."""
+    return float(shares.mean()) if len(shares) else 0.0
+
+
 @settings
 class Occupancy(Settings):
     """Sheep inside the goal, over N T: r_occupy of the paper. 1 / T at most, 1 over an episode."""
@@ -118,8 +123,7 @@ class Occlusion(Settings):
 
     def __call__(self, before: WorldState, after: WorldState, scan: Scan | None, scenario: Scenario) -> float:
         """Mean of the shares, 0 where there is no shepherd."""
-        shares = self.shares(before, after, scan, scenario)
-        return float(shares.mean()) if len(shares) else 0.0
+        return _mean(self.shares(before, after, scan, scenario))
 
 
 @settings
@@ -142,8 +146,7 @@ class Effort(Settings):
 
     def __call__(self, before: WorldState, after: WorldState, scan: Scan | None, scenario: Scenario) -> float:
         """Mean of the shares, 0 where there is no shepherd."""
-        shares = self.shares(before, after, scan, scenario)
-        return float(shares.mean()) if len(shares) else 0.0
+        return _mean(self.shares(before, after, scan, scenario))
 
 
 @settings
@@ -200,8 +203,7 @@ class Ring(Settings):
 
     def __call__(self, before: WorldState, after: WorldState, scan: Scan | None, scenario: Scenario) -> float:
         """Mean of the shares, 0 where there is no shepherd."""
-        shares = self.shares(before, after, scan, scenario)
-        return float(shares.mean()) if len(shares) else 0.0
+        return _mean(self.shares(before, after, scan, scenario))
 
 
 Scheme = Mapping[str, tuple[float, Term]]

@@ -93,13 +93,12 @@ def _told(run: Run, place: Path) -> bool:
         return False
     rows = read_rows(place / CURVE, ("rollout", "seconds"))
     judged = read_rows(place / VALIDATION, ("checkpoint", "in_goal_end"))
-    done, interval, checks = len(rows), run.preset.checkpoint_rollouts, run.preset.validation
+    done, interval = len(rows), run.preset.checkpoint_rollouts
     if not done or rows[-1]["rollout"] != done or done % interval:
         return False
     if done < run.preset.n_rollouts and rows[-1]["seconds"] < 3600.0 * run.hours:
         return False
-    n_points = len(checks.flocks) * len(checks.cohesion) * len(checks.shepherds)
-    if sum(row["checkpoint"] == done // interval for row in judged) != n_points:
+    if sum(row["checkpoint"] == done // interval for row in judged) != run.preset.validation.n_points:
         return False
     return not run.timed or home_at(judged) is None or is_policy_of(place / FIRST)
 

@@ -86,6 +86,12 @@ class Validation(Settings):
     """What a metre walked takes off the sheep delivered when the best policy is chosen [% / m]."""
 
     def __post_init__(self) -> None:
-        points = len(self.flocks) * len(self.cohesion) * len(self.shepherds)
-        if points * self.trials > MOST_EPISODES:
-            raise ValueError(f"{points} points x {self.trials} trials: at most {MOST_EPISODES} episodes a validation")
+        if self.n_points * self.trials > MOST_EPISODES:
+            raise ValueError(
+                f"{self.n_points} points x {self.trials} trials: at most {MOST_EPISODES} episodes a validation"
+            )
+
+    @property
+    def n_points(self) -> int:
+        """Points of a validation, where the flock model has an n."""
+        return len(self.flocks) * len(self.cohesion) * len(self.shepherds)
