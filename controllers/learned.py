@@ -17,6 +17,7 @@ from shepherd_phys.lidar import Lidar, beam_directions
 from shepherd_phys.observation import observe
 from shepherd_phys.state import WorldState
 
+from .hold import outside_ring
 from .network import Actor
 from .policy_files import PolicySpec, read_policy
 
@@ -54,6 +55,7 @@ class Policy:
         self._offset: NDArray[np.int64] | None = None
         self._action: NDArray[np.float64] | None = None
         self._mirrored: NDArray[np.bool_] | None = None
+        self._nowhere = np.zeros(0)
         self._rng = np.random.default_rng(0)
         self._chance = np.zeros((0, 2))
 
@@ -84,10 +86,11 @@ class Policy:
         if n == 0:
             return np.zeros((0, 2))
         if self._offset is None:
-            self._offset = np.zeros(n, np.int64)
-        if self._rolls:
-            observation, self._offset = observe(observation.reshape(n, *self._frames), self._offset, self._observed)
+            self._offset, self._nowhere = np.zeros(n, np.int64), np.full(n, np.nan)
         acting = self.spec.action
+        frames = observation.reshape(n, *self._frames) if self._rolls else observation
+        if self._rolls:
+            observation, self._offset = observe(frames, self._offset, self._observed)
         if acting.noise and (self._action is None or state.step % acting.noise_steps == 0):
             self._chance = acting.noise * self._rng.standard_normal((n, 2))
         if self._action is None or state.step % self._interval == 0:
@@ -99,7 +102,11 @@ class Policy:
             action = mean + self._chance * deviation if acting.noise else mean
             if self._mirrored is not None:
                 action = mirror.meant(action, self._mirrored)
-            self._action = _wanted(action, self._offset, self._directions, acting.rest)
+            hold = acting.hold
+            outside = self._nowhere if hold is None else outside_ring(frames, self._offset, self._observed, hold)
+            self._action = _wanted(
+                action, self._offset, self._directions, acting.rest, outside, acting.rest if hold is None else hold.rest
+            )
         return self._action.copy()
 
     def to_dict(self) -> dict[str, Any]:
@@ -108,17 +115,23 @@ class Policy:
 
 
 @njit(cache=True, error_model="numpy")
-def _wanted(actions, offset, directions, rest):  # type: ignore[no-untyped-def]
+def _wanted(actions, offset, directions, rest, outside, hold_rest):  # type: ignore[no-untyped-def]
     """Actions (P, 2) of a network as the world takes them.
 
-    Clipped to [-1, 1], as while learning, and to the unit disc, as the world does; 0 where shorter than ``rest``;
-    turned by the angle of beam ``offset`` (P,), as `shepherd_phys.observation.turn` does.
+    Clipped to [-1, 1], as while learning, and to the unit disc, as the world does; 0 where shorter than ``rest``; for
+    those who hold at least ``outside`` (P,) straight ahead, and 0 where shorter than ``hold_rest``; turned by the angle
+    of beam ``offset`` (P,), as `shepherd_phys.observation.turn` does.
     """
     wanted = np.empty(actions.shape)
     for p in range(len(actions)):
         x = min(max(np.float64(actions[p, 0]), -1.0), 1.0)
         y = min(max(np.float64(actions[p, 1]), -1.0), 1.0)
-        if math.hypot(x, y) < rest:
+        slow = rest
+        if not math.isnan(outside[p]):
+            slow = hold_rest
+            if outside[p] > 0.0:
+                x = max(x, min(outside[p], 1.0))
+        if math.hypot(x, y) < slow:
             x = y = 0.0
         length = max(math.hypot(x, y), 1.0)
         cos, sin = directions[0, offset[p]] / length, directions[1, offset[p]] / length

@@ -21,13 +21,15 @@ import safetensors.numpy
 from numpy.typing import NDArray
 from pydantic import Field
 
-from shepherd_phys import __version__
+from shepherd_phys import __version__, mirror
 from shepherd_phys.files import whole_file
 from shepherd_phys.lidar import Lidar
-from shepherd_phys.mirror import Side, check
+from shepherd_phys.mirror import Side
 from shepherd_phys.scenario import Scenario
 from shepherd_phys.settings import Settings, SettingsError, settings, tagged, untagged
 
+from . import hold
+from .hold import Hold
 from .network import ARCHITECTURES, SectorNetwork, bytes_of, without_scatter
 
 FORMAT = "shepherd_phys policy"
@@ -64,6 +66,8 @@ class Acting(Settings):
     """Control steps for which what chance adds is held; while learning those of a decision."""
     mirror: Side = "never"
     """Which shepherds see the world in a mirror."""
+    hold: Hold | None = None
+    """How a team holds the herd once it is home; none: as the policy wants, like all the time before."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +89,8 @@ class PolicySpec:
         if self.action.frame != self.lidar.frame:
             raise PolicyError(f"action.frame: must be the lidar's, {self.lidar.frame!r} (given: {self.action.frame!r})")
         try:
-            check(self.action.mirror, self.lidar)
+            mirror.check(self.action.mirror, self.lidar)
+            hold.check(self.action.hold, self.lidar)
         except SettingsError as error:
             raise PolicyError(f"action.{error}") from None
 

@@ -165,47 +165,6 @@ class Gathered(Settings):
         return float(np.count_nonzero(after.sheep_in_goal) / after.n_sheep >= self.fraction) / scenario.n_steps
 
 
-@settings
-class Ring(Settings):
-    """While the herd is home, mean over the shepherds of how far each stands off a ring round the goal, over fade T.
-
-    It is in [0, 1 / T], and 1 at most over an episode. The ring does not grow with the goal: sheep feel shepherds from
-    the same distance.
-
-    What it costs to stand wrong, so its weight is negative; in none of the paper's schemes. Three or more who stand on
-    such a ring press a herd in from all sides and hold it (as the tuned heuristics do); nearer they drive it out, and
-    from further off a large herd lies about the goal and does not fall in.
-    """
-
-    inner: float = Field(default=9.75, gt=0)
-    """Nearest place on the ring [m], from the goal's centre."""
-    outer: float = Field(default=10.5, gt=0)
-    """Furthest place on the ring [m]."""
-    fade: float = Field(default=4.0, gt=0)
-    """So far off the ring the term is 1, and no more further on [m]."""
-    home: float = Field(default=3.0, gt=0)
-    """The herd is home when no sheep is further outside the goal's border [m]."""
-    team: int = Field(default=3, ge=1, le=1000)
-    """Shepherds of the smallest team that has to stand there. Fewer would drive the herd out on the far side: for them
-    the term is 0."""
-
-    def __post_init__(self) -> None:
-        if self.outer < self.inner:
-            raise ValueError(f"outer: must be at least inner, {self.inner} (given: {self.outer})")
-
-    def shares(self, before: WorldState, after: WorldState, scan: Scan | None, scenario: Scenario) -> Floats:
-        """(P,) how far each stands off the ring, over ``fade`` T; 1 / T at most."""
-        if after.n_shepherds < self.team or after.sheep_goal_distance.max() > self.home:
-            return np.zeros(after.n_shepherds)
-        away = np.hypot(*(after.shepherd_pos - after.goal_pos).T)
-        off = np.maximum(self.inner - away, away - self.outer)
-        return np.asarray(np.clip(off / self.fade, 0.0, 1.0) / scenario.n_steps)
-
-    def __call__(self, before: WorldState, after: WorldState, scan: Scan | None, scenario: Scenario) -> float:
-        """Mean of the shares, 0 where there is no shepherd."""
-        return _mean(self.shares(before, after, scan, scenario))
-
-
 Scheme = Mapping[str, tuple[float, Term]]
 
 ORIGINAL: dict[str, tuple[float, Term]] = {"occupy": (10.0, Occupancy()), "distance": (-0.1, Distance())}
@@ -216,7 +175,7 @@ WILD: dict[str, tuple[float, Term]] = {**ORIGINAL, "occlude": (0.1, Occlusion(sh
 """The paper's "Wild Sheep"."""
 SCHEMES: dict[str, Scheme] = {"original": ORIGINAL, "any": ANY, "wild": WILD}
 """By name, for ``gymnasium.make`` and the command line."""
-TERMS: dict[str, type[Any]] = {term.__name__: term for term in (Occupancy, Distance, Occlusion, Effort, Gathered, Ring)}
+TERMS: dict[str, type[Any]] = {term.__name__: term for term in (Occupancy, Distance, Occlusion, Effort, Gathered)}
 """The library's terms by name, for files."""
 
 

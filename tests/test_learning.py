@@ -9,9 +9,10 @@ from test_learned import LIDAR, SMALL, random_weights, spec_of
 
 from shepherd_phys.bodies import Unicycle
 from shepherd_phys.controllers import Policy, load_policy
+from shepherd_phys.controllers.hold import Hold
 from shepherd_phys.controllers.network import Actor, SectorNetwork, input_shape
 from shepherd_phys.controllers.policy_files import Acting, PolicyError
-from shepherd_phys.envs.rewards import SCHEMES, Effort, Ring
+from shepherd_phys.envs.rewards import SCHEMES, Effort
 from shepherd_phys.envs.team import TeamVecEnv
 from shepherd_phys.flock import Reynolds
 from shepherd_phys.imperfections import Imperfections
@@ -377,8 +378,7 @@ def test_a_preset_may_mix_worlds_and_price_effort():
     assert 1 <= drawn.n_flocks <= 3 and drawn.flock == TINY.scenario.flock
     assert preset.scheme()["effort"] == (-2.0, Effort())
     assert preset.but(effort_team=3).scheme()["effort"] == (-2.0, Effort(team=3))
-    assert preset.scheme()["gathered"][0] == 3.0 and "ring" not in preset.scheme()
-    assert preset.but(ring=20.0).scheme()["ring"] == (-20.0, Ring())
+    assert preset.scheme()["gathered"][0] == 3.0
     with pytest.raises(SettingsError, match="effort: the reward has a term of this name already"):
         preset.but(reward={**SCHEMES["wild"], "effort": (-0.5, Effort())})
     assert set(TINY.scheme()) == set(SCHEMES["wild"])
@@ -387,7 +387,8 @@ def test_a_preset_may_mix_worlds_and_price_effort():
     assert spec_of_preset(TINY.but(noise=0.0)).action == Acting(frame="goal", noise_steps=TINY.decision_interval)
     assert spec_of_preset(TINY.but(mirror="left")).action.mirror == "left"
     assert spec_of_preset(TINY.but(mirror="left")).training["learns_mirrored"] is False
-    assert not {"rest", "noise", "mirror"} & set(spec.training)
+    assert spec_of_preset(TINY.but(hold=Hold(ring=9.0))).action.hold == Hold(ring=9.0)
+    assert not {"rest", "noise", "mirror", "hold"} & set(spec_of_preset(TINY.but(hold=Hold())).training)
     far = TINY.but(flock_distance=(4.0, 5.0), uneven=1.0).draw()(np.random.default_rng(0), 0)
     assert far.flock_distance == (4.0, 5.0) and far.flock_sizes is not None and far.n_flocks == TINY.scenario.n_flocks
     assert TINY.but(flock_distance=(4.0, 5.0)).draw() == TINY.scenario.but(flock_distance=(4.0, 5.0))
@@ -411,6 +412,9 @@ def test_a_preset_may_mix_worlds_and_price_effort():
         ("team_sizes = [0]", "team_sizes"),
         ("critic_first = 3", "critic_first: makes sense only with init"),
         ("learns_mirrored = true", "learns_mirrored: makes sense only with a mirror"),
+        ("hold = 3", "hold: must be a table"),
+        ("[hold]\nring = 0", "Hold.ring: .*greater than 0"),
+        ("[hold]\n[lidar]\nframe = 'world'", "hold: needs the frame 'goal'"),
         ("reward = 'original'\nalpha = 1.0", "alpha: the reward 'original' has no occlusion term"),
         ("lidar = 3", "lidar: must be a table"),
         ("scenario = 'moon'", "scenario: must be a table"),

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shepherd_phys.envs import ANY, ORIGINAL, SCHEMES, WILD, ShepherdingEnv
-from shepherd_phys.envs.rewards import Distance, Effort, Gathered, Occlusion, Occupancy, Ring
+from shepherd_phys.envs.rewards import Distance, Effort, Gathered, Occlusion, Occupancy
 from shepherd_phys.flock import Strombom
 from shepherd_phys.lidar import Lidar
 from shepherd_phys.scenario import Scenario
@@ -42,22 +42,6 @@ def test_gathered_pays_once_nearly_all_are_in():
     assert Gathered(fraction=0.75)(three, three, None, FOUR) == 0.1
     with pytest.raises(SettingsError, match=r"Gathered.fraction: .*less than or equal to 1 .*given: 1.5"):
         Gathered(fraction=1.5)
-
-
-def test_standing_off_the_ring_counts_for_three_while_the_herd_is_home():
-    team = FOUR.but(shepherds=3)
-    home = [[0, 0], [2.5, 0], [0, 5.5], [0, 2]]  # one sheep 3 m outside the border
-    _, state = arranged(team, home, [[10.4, 0], [0, -8.75], [-12.5, 0]])  # on it, 1 m within it, 2 m outside it
-    assert Ring().shares(state, state, None, team) == pytest.approx([0.0, 0.025, 0.05], rel=1e-12)
-    assert Ring()(state, state, None, team) == pytest.approx(0.025, rel=1e-12)
-    assert Ring(fade=1.5).shares(state, state, None, team) == pytest.approx([0.0, 0.1 / 1.5, 0.1], rel=1e-12)
-    assert Ring(inner=8.0, outer=12.5)(state, state, None, team) == 0.0
-    assert Ring(home=2.9)(state, state, None, team) == 0.0  # that sheep is not home
-    assert Ring(team=4)(state, state, None, team) == 0.0  # three are too few
-    _, nobody = arranged(FOUR.but(shepherds=0), home, np.zeros((0, 2)))
-    assert Ring(team=1)(nobody, nobody, None, FOUR) == 0.0
-    with pytest.raises(SettingsError, match=r"Ring: outer: must be at least inner, 9.75 \(given: 8"):
-        Ring(outer=8.0)
 
 
 @pytest.mark.parametrize(("norm", "divisor"), [("NT", 40), ("T", 10), ("none", 1)])

@@ -33,11 +33,10 @@ def spec_of(preset: Preset, shepherd_steps: int = 0) -> PolicySpec:
         "effort",
         "effort_team",
         "gathered",
-        "ring",
         "alpha",
         "credit",
     )
-    for name in (*elsewhere, "rest", "noise", "mirror"):
+    for name in (*elsewhere, "rest", "noise", "mirror", "hold"):
         training.pop(name, None)
     if preset.init is not None:
         training["init"] = Path(preset.init).name  # where it lay is nobody's business

@@ -9,6 +9,9 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field
 
+from shepherd_phys import mirror
+from shepherd_phys.controllers import hold
+from shepherd_phys.controllers.hold import Hold
 from shepherd_phys.controllers.learned import POLICIES, load_policy
 from shepherd_phys.controllers.network import (
     SectorNetwork,
@@ -25,7 +28,6 @@ from shepherd_phys.envs.rewards import (
     Effort,
     Gathered,
     Occlusion,
-    Ring,
     Scheme,
     Term,
     checked,
@@ -34,7 +36,7 @@ from shepherd_phys.envs.rewards import (
 )
 from shepherd_phys.learning.parts import Count, Counts, CriticNetwork, PPOSettings, Validation
 from shepherd_phys.lidar import Channel, Lidar
-from shepherd_phys.mirror import Side, check
+from shepherd_phys.mirror import Side
 from shepherd_phys.scenario import SCENARIOS, Scenario
 from shepherd_phys.settings import Foreign, Settings, SettingsError, listed, meant, read_toml, settings, write_toml
 
@@ -67,9 +69,6 @@ class Preset(Settings):
     """Smallest team that pays it in full; see `shepherd_phys.envs.rewards.Effort`."""
     gathered: float = Field(default=0.0, ge=0)
     """Weight of what is paid for while the herd is in the goal, all but a few; 0: nothing."""
-    ring: float = Field(default=0.0, ge=0)
-    """Weight of the cost of standing off a ring about the goal while the herd is home; 0: none. See
-    `shepherd_phys.envs.rewards.Ring`."""
     alpha: float | None = Field(default=None, ge=0)
     """Least useful distance of the occlusion term [m]; none: the scheme's."""
     rest: float = Field(default=0.0, ge=0, lt=1)
@@ -81,6 +80,9 @@ class Preset(Settings):
     mirror: Side = "never"
     """Of the policy when it is deployed, and validated: which shepherds see the world in a mirror; see
     `shepherd_phys.mirror`."""
+    hold: Hold | None = None
+    """Of the policy when it is deployed, and validated: how a team holds the herd once it is home; see
+    `shepherd_phys.controllers.hold`."""
     learns_mirrored: bool = False
     """Whether they do so while learning, too."""
     credit: Literal["own", "team"] = "own"
@@ -137,7 +139,7 @@ class Preset(Settings):
         for name, (_, term) in self._terms().items():
             if not (callable(term) or isinstance(term, Foreign)):
                 raise ValueError(f"reward[{name!r}]: needs a term that can be called (given: {term!r})")
-        for name in ("effort", "gathered", "ring"):
+        for name in ("effort", "gathered"):
             if getattr(self, name) and name in self._terms():
                 raise ValueError(f"{name}: the reward has a term of this name already; rename it, or give {name} = 0")
         for name in self.scenarios:
@@ -155,7 +157,8 @@ class Preset(Settings):
             )
         try:
             shapes = self.network.shapes(self.lidar)
-            check(self.mirror, self.lidar)
+            mirror.check(self.mirror, self.lidar)
+            hold.check(self.hold, self.lidar)
             self.draw()
             self.acting()  # what no policy file can say is refused before anything is learned
         except SettingsError as error:
@@ -277,8 +280,6 @@ class Preset(Settings):
             scheme["effort"] = (-self.effort, Effort(team=self.effort_team))
         if self.gathered:
             scheme["gathered"] = (self.gathered, Gathered())
-        if self.ring:
-            scheme["ring"] = (-self.ring, Ring())
         return scheme
 
     def acting(self) -> Acting:
@@ -289,6 +290,7 @@ class Preset(Settings):
             noise=self.noise,
             noise_steps=self.decision_interval,
             mirror=self.mirror,
+            hold=self.hold,
         )
 
     def start(self) -> Weights | None:
@@ -378,6 +380,7 @@ PARTS: dict[str, Callable[[Mapping[str, Any]], Any]] = {
     "network": lambda table: SectorNetwork(**without_scatter(table)),
     "critic": lambda table: CriticNetwork(**table),
     "ppo": lambda table: PPOSettings(**table),
+    "hold": lambda table: Hold(**table),
     "validation": lambda table: Validation(**table),
 }
 PRESETS = {path.stem: path for path in sorted(FOLDER.glob("*.toml"))}

@@ -1,0 +1,101 @@
+"""`Hold`: how a team that acts by a policy holds the herd once it is home.
+
+A policy tells by how wide the goal looks where to stand when all are home, and so it stands too far off a larger one to
+press in what does not fit unpressed; and an output that is never quite 0 creeps. This corrects both, by what a shepherd
+sees with its own lidar, and leaves the policy alone until every sheep that the shepherd sees is home.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from pydantic import Field
+
+from shepherd_phys.lidar import Lidar, beam_directions
+from shepherd_phys.settings import Settings, SettingsError, settings
+
+
+@settings
+class Hold(Settings):
+    """For a shepherd that sees the goal, and no sheep that is not home.
+
+    It goes at least so fast towards the goal as it is metres outside the ring, and stands still where what it wants
+    altogether is slow. It moves along the ring as the policy wants: that is what spreads a team.
+    """
+
+    ring: float = Field(default=10.5, gt=0)
+    """Radius of the ring about the goal's centre [m]: sheep feel shepherds from 10 m."""
+    home: float = Field(default=3.0, ge=0)
+    """So far outside the goal's border [m] a sheep is still home."""
+    rest: float = Field(default=0.4, ge=0, lt=1)
+    """Wanted speeds below this part of the top speed mean standing still."""
+    team: int = Field(default=3, ge=1, le=1000)
+    """Shepherds of the smallest team that holds so: fewer would press the herd out on the far side."""
+
+
+def check(hold: Hold | None, lidar: Lidar) -> None:
+    """Find out whether somebody with this lidar can hold so.
+
+    Raises:
+        SettingsError: the goal is not straight ahead, or no sheep are seen.
+    """
+    if hold is not None and (lidar.frame != "goal" or "sheep" not in lidar.channels):
+        raise SettingsError(f"hold: needs the frame 'goal' and the channel of sheep (given: {lidar})")
+
+
+def outside_ring(
+    frames: NDArray[np.float32], offset: NDArray[np.int64], lidar: Lidar, hold: Hold
+) -> NDArray[np.float64]:
+    """How far outside the ring each shepherd stands [m], below 0 inside; NaN for whoever is not to hold.
+
+    Args:
+        frames: (P, stack, channels, beams) proximities of all beams in the world frame, newest last.
+        offset: (P,) the beams that point at the goal.
+        lidar: the settings.
+        hold: the settings.
+    """
+    outside = np.full(len(frames), np.nan)
+    if len(frames) >= hold.team:
+        _outside_ring(
+            frames[:, -1], lidar.channels.index("goal"), lidar.channels.index("sheep"), lidar.goal_range, lidar.range,
+            beam_directions(lidar.beams), offset, hold.ring, hold.home, outside,
+        )  # fmt: skip
+    return outside
+
+
+@njit(cache=True, error_model="numpy")
+def _outside_ring(frame, goal, sheep, goal_range, sheep_range, directions, offset, ring, home, out):  # type: ignore[no-untyped-def]
+    """Of the rows ``goal`` and ``sheep`` of (P, channels, beams).
+
+    A disc of radius r whose centre is d away looks 2 a wide, sin a = r / d, and its nearest point is d - r away. Its
+    width is that of the circle without the widest gap between lit beams: beams that are lost within it do not matter.
+    """
+    n, _, beams = frame.shape
+    for p in range(n):
+        first, last, gap, near = -1, -1, 0, 0.0
+        for k in range(beams):
+            x = frame[p, goal, k]
+            if x > 0.0:
+                if first < 0:
+                    first = k
+                else:
+                    gap = max(gap, k - last)
+                last = k
+                near = max(near, x)
+        width = beams + 1 - max(gap, first + beams - last)
+        if first < 0 or 2 * width > beams:  # no goal to be seen, or from inside it
+            continue
+        border = goal_range * (1.0 - near)
+        centre = border / (1.0 - math.sin(math.pi * width / beams))
+        far = centre - border + home
+        x, y = centre * directions[0, offset[p]], centre * directions[1, offset[p]]
+        out[p] = centre - ring
+        for k in range(beams):
+            if frame[p, sheep, k] > 0.0:
+                d = sheep_range * (1.0 - frame[p, sheep, k])
+                if math.hypot(d * directions[0, k] - x, d * directions[1, k] - y) > far:
+                    out[p] = math.nan
+                    break

@@ -1,0 +1,124 @@
+"""How a team that acts by a policy holds the herd once it is home, by its lidar."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import settings as hypothesis_settings
+from hypothesis import strategies as st
+from scenes import arranged
+from test_learned import SMALL, random_weights, spec_of
+
+from shepherd_phys.controllers import POLICIES, Policy
+from shepherd_phys.controllers.evaluation import run_episode
+from shepherd_phys.controllers.hold import Hold, outside_ring
+from shepherd_phys.controllers.policy_files import PolicyError
+from shepherd_phys.envs import ShepherdingEnv
+from shepherd_phys.lidar import Lidar
+from shepherd_phys.observation import encode, observe
+from shepherd_phys.scenario import Scenario
+from shepherd_phys.world import World
+
+LIDAR = Lidar(stack=1, frame="goal")
+HOME = ((0.0, 0.0), (2.0, 1.0), (0.0, 5.2))  # the last one 2.7 m outside the border
+
+
+def frames(sheep, shepherds, goal=(0.0, 0.0), lidar=LIDAR, goal_radius=2.5):
+    """What shepherds at these places see, and the beams that point at the goal."""
+    world = World(Scenario(n_sheep=len(sheep), n_flocks=1, shepherds=len(shepherds), goal_radius=goal_radius))
+    world.reset_to(arranged(sheep, shepherds, goal), 0)
+    seen = encode(world.scan(lidar), lidar)[:, None]
+    return seen, observe(seen, np.zeros(len(shepherds), np.int64), lidar)[1]
+
+
+def outside(sheep, shepherds, hold=None, **how):
+    return outside_ring(*frames(sheep, shepherds, **how), LIDAR, hold or Hold())
+
+
+AROUND = ((14.0, 0.0), (0.0, -8.5), (-9.0, 12.0))
+
+
+@pytest.mark.parametrize("goal_radius", [1.5, 2.5, 3.54])
+def test_how_far_outside_the_ring_one_stands_by_how_wide_the_goal_looks(goal_radius):
+    told = outside(((0.0, 0.0),), AROUND, goal_radius=goal_radius)
+    np.testing.assert_allclose(told, [3.5, -2.0, 4.5], atol=0.15)  # beams are 0.7 degrees apart
+    assert outside(((0.0, 0.0),), AROUND, Hold(ring=12.0), goal_radius=goal_radius) == pytest.approx(told - 1.5)
+
+
+def test_only_those_hold_who_see_no_sheep_that_is_not_home():
+    assert np.isfinite(outside(HOME, AROUND)).all()
+    assert np.isnan(outside((*HOME, (0.0, -6.0)), AROUND)).all()
+    assert np.isfinite(outside((*HOME, (0.0, -6.0)), AROUND, Hold(home=4.0))).all()
+    # a sheep in the shadow of another is not seen: the first shepherd has them in a line, the others do not
+    shadow = outside(((2.0, 0.0), (-6.0, 0.0)), AROUND)
+    assert np.isfinite(shadow).tolist() == [True, False, False]
+
+
+def test_nobody_holds_inside_the_goal_without_sight_of_it_or_in_too_small_a_team():
+    assert np.isfinite(outside(HOME, ((14.0, 0.0), (1.0, 0.0), (0.0, 9.0)))).tolist() == [True, False, True]
+    seen, offset = frames(HOME, AROUND)
+    seen[1, :, LIDAR.channels.index("goal")] = 0.0
+    assert np.isfinite(outside_ring(seen, offset, LIDAR, Hold())).tolist() == [True, False, True]
+    assert np.isnan(outside(HOME, AROUND[:2])).all()
+    assert np.isfinite(outside(HOME, AROUND[:2], Hold(team=2))).all()
+
+
+def test_lost_beams_change_it_little():
+    seen, offset = frames(HOME, AROUND)
+    whole = outside_ring(seen, offset, LIDAR, Hold())
+    for seed in range(20):
+        lost = seen * (np.random.default_rng(seed).random(seen.shape) > 0.1)
+        assert outside_ring(lost.astype(np.float32), offset, LIDAR, Hold()) == pytest.approx(whole, abs=0.3)
+
+
+@hypothesis_settings(max_examples=30, deadline=None)
+@given(angle=st.floats(0, 6.28), x=st.floats(-20, 20), y=st.floats(-20, 20))
+def test_it_is_the_same_wherever_the_scene_lies_and_however_it_is_turned(angle, x, y):
+    turned = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    moved = [np.array(points) @ turned.T + (x, y) for points in (HOME, AROUND)]
+    assert outside(*moved, goal=(x, y)) == pytest.approx(outside(HOME, AROUND), abs=0.3)
+
+
+def acts(policy, sheep, shepherds):
+    """Actions in the goal frame: along the way to the goal, and across."""
+    seen, offset = frames(sheep, shepherds)
+    policy.reset(np.random.default_rng(0))
+    action = policy.act(seen.reshape(len(shepherds), -1, LIDAR.beams), World(Scenario()).reset(0))
+    angle = -2 * np.pi * offset / LIDAR.beams
+    along = np.cos(angle) * action[:, 0] - np.sin(angle) * action[:, 1]
+    return np.column_stack((along, np.sin(angle) * action[:, 0] + np.cos(angle) * action[:, 1]))
+
+
+def test_who_holds_goes_to_the_ring_and_keeps_its_way_along_it():
+    weights = random_weights(SMALL, LIDAR)
+    weights["action.weight"] *= 0.0
+    weights["action.bias"][:] = -0.5, 0.3
+
+    def team(**hold):
+        return Policy(spec_of(LIDAR, hold=Hold(**hold)), weights)
+
+    plain = Policy(spec_of(LIDAR), weights)
+    near = ((10.9, 0.0), (0.0, -8.5), (-9.0, 12.0))
+    np.testing.assert_allclose(acts(plain, HOME, near), [(-0.5, 0.3)] * 3, atol=1e-6)
+    far = 1 / np.hypot(1.0, 0.3)  # who goes at full speed ahead goes no faster for its way along
+    np.testing.assert_allclose(acts(team(rest=0.2), HOME, near), [(0.4, 0.3), (-0.5, 0.3), (far, 0.3 * far)], atol=0.15)
+    # what is slow altogether is standing still; for who does not hold it is the policy's own limit that counts
+    assert np.flatnonzero(acts(team(rest=0.9), HOME, near).any(axis=1)).tolist() == [2]
+    np.testing.assert_allclose(acts(team(rest=0.9), (*HOME, (0.0, -6.0)), near), [(-0.5, 0.3)] * 3, atol=1e-6)
+
+
+@pytest.mark.parametrize("lidar", [Lidar(), Lidar(frame="goal", channels=("goal",))])
+def test_holding_needs_the_goal_ahead_and_sheep_to_see(lidar):
+    with pytest.raises(PolicyError, match=r"action.hold: needs the frame 'goal' and the channel of sheep"):
+        spec_of(lidar, hold=Hold())
+
+
+def test_collie_holds_a_herd_that_its_policy_alone_would_not_press_home():
+    collie = POLICIES["collie"]()
+    assert collie.spec.action.hold is not None
+    alone = Policy(replace(collie.spec, action=collie.spec.action.but(hold=None)), collie.weights)
+    large = Scenario(n_sheep=200, goal_radius=2.5 * 2**0.5, n_flocks=2, shepherds=3, terminate_on_success=False)
+    env = ShepherdingEnv(large, lidar=collie.lidar, rewards={})
+    held, loose = (run_episode(policy, env, 2)["in_goal_end"] for policy in (collie, alone))
+    assert held >= 97 and loose < 80
