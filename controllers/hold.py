@@ -2,7 +2,7 @@
 
 A policy tells by how wide the goal looks where to stand when all are home, and so it stands too far off a larger one to
 press in what does not fit unpressed; and an output that is never quite 0 creeps. This corrects both, by what a shepherd
-sees with its own lidar, and leaves the policy alone until every sheep that the shepherd sees is home.
+sees with its own lidar, and leaves the policy alone until the shepherd sees sheep, and all of them are home.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from shepherd_phys.settings import Settings, SettingsError, settings
 
 @settings
 class Hold(Settings):
-    """For a shepherd that sees the goal, and no sheep that is not home.
+    """For a shepherd that sees the goal, and sheep, all of them home.
 
     It goes at least so fast towards the goal as it is metres outside the ring, and stands still where what it wants
     altogether is slow. It moves along the ring as the policy wants: that is what spreads a team.
@@ -92,9 +92,9 @@ def _outside_ring(frame, goal, sheep, goal_range, sheep_range, directions, offse
         centre = border / (1.0 - math.sin(math.pi * width / beams))
         far = centre - border + home
         x, y = centre * directions[0, offset[p]], centre * directions[1, offset[p]]
-        out[p] = centre - ring
         for k in range(beams):
             if frame[p, sheep, k] > 0.0:
+                out[p] = centre - ring
                 d = sheep_range * (1.0 - frame[p, sheep, k])
                 if math.hypot(d * directions[0, k] - x, d * directions[1, k] - y) > far:
                     out[p] = math.nan

@@ -55,10 +55,13 @@ def test_only_those_hold_who_see_no_sheep_that_is_not_home():
     assert np.isfinite(shadow).tolist() == [True, False, False]
 
 
-def test_nobody_holds_inside_the_goal_without_sight_of_it_or_in_too_small_a_team():
+def test_nobody_holds_inside_the_goal_without_sight_of_it_or_of_sheep_or_in_too_small_a_team():
     assert np.isfinite(outside(HOME, ((14.0, 0.0), (1.0, 0.0), (0.0, 9.0)))).tolist() == [True, False, True]
     seen, offset = frames(HOME, AROUND)
     seen[1, :, LIDAR.channels.index("goal")] = 0.0
+    assert np.isfinite(outside_ring(seen, offset, LIDAR, Hold())).tolist() == [True, False, True]
+    seen, offset = frames(HOME, AROUND)
+    seen[1, :, LIDAR.channels.index("sheep")] = 0.0
     assert np.isfinite(outside_ring(seen, offset, LIDAR, Hold())).tolist() == [True, False, True]
     assert np.isnan(outside(HOME, AROUND[:2])).all()
     assert np.isfinite(outside(HOME, AROUND[:2], Hold(team=2))).all()
