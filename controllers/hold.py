@@ -28,6 +28,9 @@ class Hold(Settings):
 
     ring: float = Field(default=10.5, gt=0)
     """Radius of the ring about the goal's centre [m]: sheep feel shepherds from 10 m."""
+    inside: float | None = Field(default=None, ge=0)
+    """So far inside the ring [m] it may stand; from nearer it goes back as fast as it would come. None: as near as the
+    policy wants."""
     home: float = Field(default=3.0, ge=0)
     """So far outside the goal's border [m] a sheep is still home."""
     rest: float = Field(default=0.4, ge=0, lt=1)
@@ -49,7 +52,7 @@ def check(hold: Hold | None, lidar: Lidar) -> None:
 def outside_ring(
     frames: NDArray[np.float32], offset: NDArray[np.int64], lidar: Lidar, hold: Hold
 ) -> NDArray[np.float64]:
-    """How far outside the ring each shepherd stands [m], below 0 inside; NaN for whoever is not to hold.
+    """How far outside the ring each shepherd stands [m], below 0 inside; NaN for whoever sees no herd that is home.
 
     Args:
         frames: (P, stack, channels, beams) proximities of all beams in the world frame, newest last.
@@ -58,11 +61,10 @@ def outside_ring(
         hold: the settings.
     """
     outside = np.full(len(frames), np.nan)
-    if len(frames) >= hold.team:
-        _outside_ring(
-            frames[:, -1], lidar.channels.index("goal"), lidar.channels.index("sheep"), lidar.goal_range, lidar.range,
-            beam_directions(lidar.beams), offset, hold.ring, hold.home, outside,
-        )  # fmt: skip
+    _outside_ring(
+        frames[:, -1], lidar.channels.index("goal"), lidar.channels.index("sheep"), lidar.goal_range, lidar.range,
+        beam_directions(lidar.beams), offset, hold.ring, hold.home, outside,
+    )  # fmt: skip
     return outside
 
 

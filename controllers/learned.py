@@ -20,6 +20,7 @@ from shepherd_phys.state import WorldState
 from .hold import outside_ring
 from .network import Actor
 from .policy_files import PolicySpec, read_policy
+from .wander import Wanderer
 
 SHIPPED = Path(__file__).parent / "policies"
 
@@ -52,12 +53,16 @@ class Policy:
         self._observed, self._interval = spec.lidar, spec.action.interval
         self._lidar = spec.lidar.but(frame="world", sectors=None) if self._rolls else spec.lidar
         self._directions = beam_directions(spec.lidar.beams)
+        hold = spec.action.hold
+        deep = math.inf if hold is None or hold.inside is None else hold.inside
+        self._hold = (0.0 if hold is None else hold.rest, deep)
+        self._nowhere = np.zeros(0)
+        self._chance = np.zeros((0, 2))
         self._offset: NDArray[np.int64] | None = None
         self._action: NDArray[np.float64] | None = None
         self._mirrored: NDArray[np.bool_] | None = None
-        self._nowhere = np.zeros(0)
-        self._rng = np.random.default_rng(0)
-        self._chance = np.zeros((0, 2))
+        self._wanderer: Wanderer | None = None
+        self.reset(np.random.default_rng(0))
 
     @classmethod
     def load(cls, path: str | Path, classes: Iterable[Any] = ()) -> Self:
@@ -74,6 +79,8 @@ class Policy:
         """Forget the last episode."""
         self._offset = self._action = self._mirrored = None
         self._rng = rng
+        wander = self.spec.action.wander
+        self._wanderer = None if wander is None else Wanderer(wander, rng)
 
     def act(self, observation: NDArray[np.float32], state: WorldState) -> NDArray[np.float64]:
         """(P, 2).
@@ -102,11 +109,12 @@ class Policy:
             action = mean + self._chance * deviation if acting.noise else mean
             if self._mirrored is not None:
                 action = mirror.meant(action, self._mirrored)
-            hold = acting.hold
-            outside = self._nowhere if hold is None else outside_ring(frames, self._offset, self._observed, hold)
-            self._action = _wanted(
-                action, self._offset, self._directions, acting.rest, outside, acting.rest if hold is None else hold.rest
-            )
+            hold, nowhere = acting.hold, self._nowhere
+            outside = nowhere if hold is None else outside_ring(frames, self._offset, self._observed, hold)
+            held = nowhere if hold is None or n < hold.team else outside
+            self._action = _wanted(action, self._offset, self._directions, acting.rest, held, self._hold)
+            if self._wanderer is not None:
+                self._action = self._wanderer(self._action, np.isfinite(outside))
         return self._action.copy()
 
     def to_dict(self) -> dict[str, Any]:
@@ -115,12 +123,12 @@ class Policy:
 
 
 @njit(cache=True, error_model="numpy")
-def _wanted(actions, offset, directions, rest, outside, hold_rest):  # type: ignore[no-untyped-def]
+def _wanted(actions, offset, directions, rest, outside, hold):  # type: ignore[no-untyped-def]
     """Actions (P, 2) of a network as the world takes them.
 
-    Clipped to [-1, 1], as while learning, and to the unit disc, as the world does; 0 where shorter than ``rest``; for
-    those who hold at least ``outside`` (P,) straight ahead, and 0 where shorter than ``hold_rest``; turned by the angle
-    of beam ``offset`` (P,), as `shepherd_phys.observation.turn` does.
+    Clipped to [-1, 1], as while learning, and to the unit disc, as the world does; 0 where shorter than ``rest``;
+    turned by the angle of beam ``offset`` (P,), as `shepherd_phys.observation.turn` does. Those who hold, ``outside``
+    (P,) of the ring [m], by ``hold``: what is rest to them, and how far inside the ring they may stand [m].
     """
     wanted = np.empty(actions.shape)
     for p in range(len(actions)):
@@ -128,9 +136,11 @@ def _wanted(actions, offset, directions, rest, outside, hold_rest):  # type: ign
         y = min(max(np.float64(actions[p, 1]), -1.0), 1.0)
         slow = rest
         if not math.isnan(outside[p]):
-            slow = hold_rest
+            slow, deep = hold
             if outside[p] > 0.0:
                 x = max(x, min(outside[p], 1.0))
+            elif outside[p] < -deep:
+                x = min(x, max(outside[p] + deep, -1.0))
         if math.hypot(x, y) < slow:
             x = y = 0.0
         length = max(math.hypot(x, y), 1.0)

@@ -31,6 +31,7 @@ from shepherd_phys.settings import Settings, SettingsError, settings, tagged, un
 from . import hold
 from .hold import Hold
 from .network import ARCHITECTURES, SectorNetwork, bytes_of, without_scatter
+from .wander import Wander
 
 FORMAT = "shepherd_phys policy"
 FORMAT_VERSION = 1
@@ -68,6 +69,12 @@ class Acting(Settings):
     """Which shepherds see the world in a mirror."""
     hold: Hold | None = None
     """How a team holds the herd once it is home; none: as the policy wants, like all the time before."""
+    wander: Wander | None = None
+    """What a shepherd does whose policy gets it nowhere; none: it waits."""
+
+    def __post_init__(self) -> None:
+        if self.wander is not None and self.hold is None:
+            raise ValueError("wander: needs hold, which tells who stands still for good reason (given: hold = none)")
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ def spec_of(preset: Preset, shepherd_steps: int = 0) -> PolicySpec:
         "alpha",
         "credit",
     )
-    for name in (*elsewhere, "rest", "noise", "mirror", "hold"):
+    for name in (*elsewhere, "rest", "noise", "mirror", "hold", "wander"):
         training.pop(name, None)
     if preset.init is not None:
         training["init"] = Path(preset.init).name  # where it lay is nobody's business

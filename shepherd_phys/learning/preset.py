@@ -22,6 +22,7 @@ from shepherd_phys.controllers.network import (
     without_scatter,
 )
 from shepherd_phys.controllers.policy_files import MAX_FRAMES, MAX_WEIGHTS, Acting
+from shepherd_phys.controllers.wander import Wander
 from shepherd_phys.envs.mixture import Mixture
 from shepherd_phys.envs.rewards import (
     SCHEMES,
@@ -83,6 +84,9 @@ class Preset(Settings):
     hold: Hold | None = None
     """Of the policy when it is deployed, and validated: how a team holds the herd once it is home; see
     `shepherd_phys.controllers.hold`."""
+    wander: Wander | None = None
+    """Of the policy when it is deployed, and validated: what a shepherd does whose policy gets it nowhere; see
+    `shepherd_phys.controllers.wander`."""
     learns_mirrored: bool = False
     """Whether they do so while learning, too."""
     credit: Literal["own", "team"] = "own"
@@ -291,6 +295,7 @@ class Preset(Settings):
             noise_steps=self.decision_interval,
             mirror=self.mirror,
             hold=self.hold,
+            wander=self.wander,
         )
 
     def start(self) -> Weights | None:
@@ -381,6 +386,7 @@ PARTS: dict[str, Callable[[Mapping[str, Any]], Any]] = {
     "critic": lambda table: CriticNetwork(**table),
     "ppo": lambda table: PPOSettings(**table),
     "hold": lambda table: Hold(**table),
+    "wander": lambda table: Wander(**table),
     "validation": lambda table: Validation(**table),
 }
 PRESETS = {path.stem: path for path in sorted(FOLDER.glob("*.toml"))}

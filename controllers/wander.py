@@ -1,0 +1,71 @@
+"""`Wander`: what a shepherd does whose policy gets it nowhere.
+
+A policy sees a few frames and remembers nothing. Where it sees no goal or no sheep for an obstacle, or stands just
+beyond what sheep feel and waits, nothing changes what it sees, and it stays for good. Some steps at random change that.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from shepherd_phys.settings import Settings, settings
+
+
+@settings
+class Wander(Settings):
+    """For a shepherd that does not see a herd that is home: if a running mean of the velocities that it wants has been
+    short for some time, it walks at full speed in a random direction for a while.
+    """  # noqa: D205
+
+    memory: float = Field(default=0.02, gt=0, le=1)
+    """Part that a decision makes of the mean; at 0.02 it reaches some ten seconds back."""
+    least: float = Field(default=0.2, gt=0, le=1)
+    """Means shorter than this part of the top speed are short."""
+    after: int = Field(default=30, ge=1, le=100_000)
+    """Decisions for which it must have been short."""
+    shortest: int = Field(default=10, ge=1, le=100_000)
+    """Least decisions of a walk."""
+    longest: int = Field(default=29, ge=1, le=100_000)
+    """Most decisions of a walk."""
+
+    def __post_init__(self) -> None:
+        if self.longest < self.shortest:
+            raise ValueError(f"longest: must be at least shortest, {self.shortest} (given: {self.longest})")
+
+
+class Wanderer:
+    """Who of a team wanders, in one episode.
+
+    Args:
+        settings: the settings.
+        rng: of the episode; directions and lengths of walks are drawn from it.
+    """
+
+    def __init__(self, settings: Wander, rng: np.random.Generator) -> None:
+        self._settings = settings
+        self._rng = rng
+        self._mean: NDArray[np.float64] | None = None
+        self._short = np.zeros(0, np.int64)
+        self._left = np.zeros(0, np.int64)
+        self._way = np.zeros((0, 2))
+
+    def __call__(self, wanted: NDArray[np.float64], holds: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """What the team does (P, 2) where its policy wants ``wanted`` (P, 2) and those who ``holds`` (P,) stay."""
+        own = self._settings
+        if self._mean is None:
+            n = len(wanted)
+            self._mean, self._way = wanted.copy(), np.zeros((n, 2))
+            self._short, self._left = np.zeros(n, np.int64), np.zeros(n, np.int64)
+        self._mean += own.memory * (wanted - self._mean)
+        short = (np.hypot(*self._mean.T) < own.least) & ~holds
+        self._short = np.where(short, self._short + 1, 0)
+        for p in np.flatnonzero((self._short >= own.after) & (self._left == 0)):
+            angle = self._rng.uniform(0.0, 2.0 * np.pi)
+            self._way[p] = np.cos(angle), np.sin(angle)
+            self._left[p] = self._rng.integers(own.shortest, own.longest, endpoint=True)
+            self._short[p] = 0
+        walks = self._left > 0
+        self._left[walks] -= 1
+        return np.where(walks[:, None], self._way, wanted)
