@@ -20,26 +20,31 @@ from shepherd_phys.settings import Settings, SettingsError, settings
 
 @settings
 class Hold(Settings):
-    """For a shepherd that sees the goal, and sheep, all of them home.
+    """For a shepherd that sees the goal from outside, and sheep, all of them home.
 
-    It goes at least so fast towards the goal as it is metres outside the ring, and stands still where what it wants
-    altogether is slow. It moves along the ring as the policy wants: that is what spreads a team.
+    Its action towards the goal is at least as many metres as it is outside the ring, 1 at most; where the whole action
+    is then short it stands still, so up to ``rest`` metres outside. Along the ring it moves as the policy wants: that
+    is what spreads a team.
+
+    What it goes by is what it sees. Sheep that others hide, or that are out of range, count for nothing. A goal of
+    which an obstacle hides one side looks narrower, and so nearer, by its radius at most; noise on ranges makes its
+    nearest point look nearer, and the ring that much wider: 5 % by 0.9 m.
     """
 
     ring: float = Field(default=10.5, gt=0)
     """Radius of the ring about the goal's centre [m]: sheep feel shepherds from 10 m."""
     inside: float | None = Field(default=None, ge=0)
-    """So far inside the ring [m] it may stand; from nearer it goes back as fast as it would come. None: as near as the
-    policy wants."""
+    """So far inside the ring [m] it may stand: from nearer its action is at least the metres back, 1 at most. None: as
+    near as the policy wants."""
     home: float = Field(default=3.0, ge=0)
-    """So far outside the goal's border [m] a sheep is still home."""
+    """So far outside the goal's border [m] the point that is seen of a sheep is still home."""
     rest: float = Field(default=0.4, ge=0, lt=1)
     """Wanted speeds below this part of the top speed mean standing still."""
     team: int = Field(default=3, ge=1, le=1000)
     """Shepherds of the smallest team that holds so: fewer would press the herd out on the far side."""
 
 
-def check(hold: Hold | None, lidar: Lidar) -> None:
+def check_hold(hold: Hold | None, lidar: Lidar) -> None:
     """Find out whether somebody with this lidar can hold so.
 
     Raises:
@@ -88,7 +93,7 @@ def _outside_ring(frame, goal, sheep, goal_range, sheep_range, directions, offse
                 last = k
                 near = max(near, x)
         width = beams + 1 - max(gap, first + beams - last)
-        if first < 0 or 2 * width > beams:  # no goal to be seen, or from inside it
+        if first < 0 or 2 * width >= beams:  # no goal to be seen, or from inside it
             continue
         border = goal_range * (1.0 - near)
         centre = border / (1.0 - math.sin(math.pi * width / beams))

@@ -28,8 +28,8 @@ SHIPPED = Path(__file__).parent / "policies"
 class Policy:
     """Moves every shepherd by the same network, each by its own observation alone.
 
-    The action is the mean of the distribution that it had while learning, clipped to the unit disc; where
-    ``spec.action.noise`` says so with chance added, a function of the episode's seed.
+    The action is the mean of the distribution that it had while learning, clipped to the unit disc. What else becomes
+    of it when it is deployed ``spec.action`` tells; all chance in it is a function of the episode's seed.
 
     Args:
         spec: what it was trained with.
@@ -55,8 +55,8 @@ class Policy:
         self._directions = beam_directions(spec.lidar.beams)
         hold = spec.action.hold
         deep = math.inf if hold is None or hold.inside is None else hold.inside
-        self._hold = (0.0 if hold is None else hold.rest, deep)
-        self._nowhere = np.zeros(0)
+        self._limits = (0.0 if hold is None else hold.rest, deep)
+        self._nobody = np.zeros(0)
         self._chance = np.zeros((0, 2))
         self._offset: NDArray[np.int64] | None = None
         self._action: NDArray[np.float64] | None = None
@@ -93,7 +93,7 @@ class Policy:
         if n == 0:
             return np.zeros((0, 2))
         if self._offset is None:
-            self._offset, self._nowhere = np.zeros(n, np.int64), np.full(n, np.nan)
+            self._offset, self._nobody = np.zeros(n, np.int64), np.full(n, np.nan)
         acting = self.spec.action
         frames = observation.reshape(n, *self._frames) if self._rolls else observation
         if self._rolls:
@@ -109,10 +109,10 @@ class Policy:
             action = mean + self._chance * deviation if acting.noise else mean
             if self._mirrored is not None:
                 action = mirror.meant(action, self._mirrored)
-            hold, nowhere = acting.hold, self._nowhere
-            outside = nowhere if hold is None else outside_ring(frames, self._offset, self._observed, hold)
-            held = nowhere if hold is None or n < hold.team else outside
-            self._action = _wanted(action, self._offset, self._directions, acting.rest, held, self._hold)
+            hold, nobody = acting.hold, self._nobody
+            outside = nobody if hold is None else outside_ring(frames, self._offset, self._observed, hold)
+            held = nobody if hold is None or n < hold.team else outside
+            self._action = _wanted(action, self._offset, self._directions, acting.rest, held, self._limits)
             if self._wanderer is not None:
                 self._action = self._wanderer(self._action, np.isfinite(outside))
         return self._action.copy()
@@ -123,12 +123,13 @@ class Policy:
 
 
 @njit(cache=True, error_model="numpy")
-def _wanted(actions, offset, directions, rest, outside, hold):  # type: ignore[no-untyped-def]
+def _wanted(actions, offset, directions, rest, outside, limits):  # type: ignore[no-untyped-def]
     """Actions (P, 2) of a network as the world takes them.
 
     Clipped to [-1, 1], as while learning, and to the unit disc, as the world does; 0 where shorter than ``rest``;
-    turned by the angle of beam ``offset`` (P,), as `shepherd_phys.observation.turn` does. Those who hold, ``outside``
-    (P,) of the ring [m], by ``hold``: what is rest to them, and how far inside the ring they may stand [m].
+    turned by the angle of beam ``offset`` (P,), as `shepherd_phys.observation.turn` does. ``outside`` (P,) is how far
+    those who hold are outside their ring [m], NaN for others; ``limits`` are theirs: what is short for them in place of
+    ``rest``, and how far inside the ring they may stand [m].
     """
     wanted = np.empty(actions.shape)
     for p in range(len(actions)):
@@ -136,7 +137,7 @@ def _wanted(actions, offset, directions, rest, outside, hold):  # type: ignore[n
         y = min(max(np.float64(actions[p, 1]), -1.0), 1.0)
         slow = rest
         if not math.isnan(outside[p]):
-            slow, deep = hold
+            slow, deep = limits
             if outside[p] > 0.0:
                 x = max(x, min(outside[p], 1.0))
             elif outside[p] < -deep:

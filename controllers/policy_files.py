@@ -28,8 +28,7 @@ from shepherd_phys.mirror import Side
 from shepherd_phys.scenario import Scenario
 from shepherd_phys.settings import Settings, SettingsError, settings, tagged, untagged
 
-from . import hold
-from .hold import Hold
+from .hold import Hold, check_hold
 from .network import ARCHITECTURES, SectorNetwork, bytes_of, without_scatter
 from .wander import Wander
 
@@ -97,7 +96,7 @@ class PolicySpec:
             raise PolicyError(f"action.frame: must be the lidar's, {self.lidar.frame!r} (given: {self.action.frame!r})")
         try:
             mirror.check(self.action.mirror, self.lidar)
-            hold.check(self.action.hold, self.lidar)
+            check_hold(self.action.hold, self.lidar)
         except SettingsError as error:
             raise PolicyError(f"action.{error}") from None
 
@@ -196,10 +195,15 @@ def _spec(table: Mapping[str, Any], classes: Iterable[Any]) -> PolicySpec:
         scenario=Scenario.from_dict(_table(table, "scenario"), classes),
         lidar=Lidar(**_table(table, "lidar")),
         network=_network(_table(table, "network")),
-        action=Acting(**_table(table, "action")),
+        action=_acting(_table(table, "action")),
         rewards=_table(table, "rewards"),
         training=_table(table, "training"),
     )
+
+
+def _acting(table: Mapping[str, Any]) -> Acting:
+    parts = {name: made for name, made in (("hold", Hold), ("wander", Wander)) if name in table}
+    return Acting(**{**table, **{name: made(**_table(table, name)) for name, made in parts.items()}})
 
 
 def _network(table: Mapping[str, Any]) -> SectorNetwork:

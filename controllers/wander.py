@@ -16,15 +16,17 @@ from shepherd_phys.settings import Settings, settings
 @settings
 class Wander(Settings):
     """For a shepherd that does not see a herd that is home: if a running mean of the velocities that it wants has been
-    short for some time, it walks at full speed in a random direction for a while.
+    short for some time, it walks at full speed in a random direction for a while, or until it sees the herd home.
+    Nobody sees that from within the goal, from where whoever stands still walks off. Lengths of time are in decisions
+    of the deployed policy; the figures given here are for one each control step of 0.2 s.
     """  # noqa: D205
 
     memory: float = Field(default=0.02, gt=0, le=1)
-    """Part that a decision makes of the mean; at 0.02 it reaches some ten seconds back."""
+    """Part that a decision makes of the mean; at 0.02 it reaches some 50 decisions back: ten seconds."""
     least: float = Field(default=0.2, gt=0, le=1)
     """Means shorter than this part of the top speed are short."""
     after: int = Field(default=30, ge=1, le=100_000)
-    """Decisions for which it must have been short."""
+    """Decisions for which it must have been short, those of the last walk among them."""
     shortest: int = Field(default=10, ge=1, le=100_000)
     """Least decisions of a walk."""
     longest: int = Field(default=29, ge=1, le=100_000)
@@ -51,21 +53,22 @@ class Wanderer:
         self._left = np.zeros(0, np.int64)
         self._way = np.zeros((0, 2))
 
-    def __call__(self, wanted: NDArray[np.float64], holds: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """What the team does (P, 2) where its policy wants ``wanted`` (P, 2) and those who ``holds`` (P,) stay."""
+    def __call__(self, wanted: NDArray[np.float64], home: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """What the team does (P, 2) where its policy wants ``wanted`` (P, 2); who sees the herd ``home`` (P,) stays."""
         own = self._settings
         if self._mean is None:
             n = len(wanted)
             self._mean, self._way = wanted.copy(), np.zeros((n, 2))
             self._short, self._left = np.zeros(n, np.int64), np.zeros(n, np.int64)
         self._mean += own.memory * (wanted - self._mean)
-        short = (np.hypot(*self._mean.T) < own.least) & ~holds
+        short = (np.hypot(*self._mean.T) < own.least) & ~home
         self._short = np.where(short, self._short + 1, 0)
         for p in np.flatnonzero((self._short >= own.after) & (self._left == 0)):
             angle = self._rng.uniform(0.0, 2.0 * np.pi)
             self._way[p] = np.cos(angle), np.sin(angle)
             self._left[p] = self._rng.integers(own.shortest, own.longest, endpoint=True)
             self._short[p] = 0
+        self._left[home] = 0
         walks = self._left > 0
         self._left[walks] -= 1
         return np.where(walks[:, None], self._way, wanted)

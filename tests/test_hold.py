@@ -11,13 +11,15 @@ from scenes import arranged
 from test_learned import SMALL, random_weights, spec_of
 
 from shepherd_phys.controllers import POLICIES, Policy
-from shepherd_phys.controllers.evaluation import run_episode
+from shepherd_phys.controllers.evaluation import run_episode, trial_seed
 from shepherd_phys.controllers.hold import Hold, outside_ring
 from shepherd_phys.controllers.policy_files import PolicyError
 from shepherd_phys.envs import ShepherdingEnv
+from shepherd_phys.layouts import Scattered
+from shepherd_phys.learning.preset import load_preset
 from shepherd_phys.lidar import Lidar
 from shepherd_phys.observation import encode, observe
-from shepherd_phys.scenario import Scenario
+from shepherd_phys.scenario import SCENARIOS, Scenario
 from shepherd_phys.world import World
 
 LIDAR = Lidar(stack=1, frame="goal")
@@ -69,8 +71,32 @@ def test_lost_beams_change_it_little():
     seen, offset = frames(HOME, AROUND)
     whole = outside_ring(seen, offset, LIDAR, Hold())
     for seed in range(20):
-        lost = seen * (np.random.default_rng(seed).random(seen.shape) > 0.1)
-        assert outside_ring(lost.astype(np.float32), offset, LIDAR, Hold()) == pytest.approx(whole, abs=0.3)
+        lost = (seen * (np.random.default_rng(seed).random(seen.shape) > 0.1)).astype(np.float32)
+        turned = observe(lost, np.zeros(3, np.int64), LIDAR)[1]
+        assert outside_ring(lost, turned, LIDAR, Hold()) == pytest.approx(whole, abs=0.4)
+
+
+def test_it_goes_by_the_newest_frame_whatever_the_channels_and_sectors():
+    whole, offset = frames(HOME, AROUND)
+    for lidar in (
+        LIDAR.but(stack=2, sectors=64),
+        LIDAR.but(stack=2, channels=("sheep", "goal")),
+        LIDAR.but(stack=2, channels=("sheep", "shepherds", "goal", "obstacles")),
+    ):
+        (newest, _), (older, _) = (frames(sheep, AROUND, lidar=lidar) for sheep in (HOME, (*HOME, (0.0, -6.0))))
+        told = outside_ring(np.concatenate((older, newest), axis=1), offset, lidar, Hold())
+        np.testing.assert_array_equal(told, outside_ring(whole, offset, LIDAR, Hold()))
+        assert np.isnan(outside_ring(np.concatenate((newest, older), axis=1), offset, lidar, Hold())).all()
+
+
+def test_on_the_border_half_of_the_beams_see_the_goal_and_nobody_holds():
+    seen, offset = frames(HOME, AROUND)
+    row = seen[0, 0, LIDAR.channels.index("goal")]
+    row[:] = 0.0
+    row[:255] = 0.999
+    assert np.isfinite(outside_ring(seen, offset, LIDAR, Hold(home=40.0))[0])
+    row[255] = 0.999
+    assert np.isnan(outside_ring(seen, offset, LIDAR, Hold(home=40.0))[0])
 
 
 @hypothesis_settings(max_examples=30, deadline=None)
@@ -118,6 +144,21 @@ def test_who_holds_goes_to_the_ring_and_keeps_its_way_along_it():
     assert acts(team(team=2), HOME, near[:2])[0, 0] > 0.2
 
 
+def test_it_comes_after_the_mirror_and_chance_is_of_the_episodes_seed():
+    weights = random_weights(SMALL, LIDAR)
+    weights["action.weight"] *= 0.0
+    weights["action.bias"][:] = -0.5, 0.3
+    # sheep to the left of the goal as seen by the first, to its right as seen by the second
+    sheep, shepherds = ((0.0, -2.0),), ((14.0, 0.0), (-14.0, 0.0), (0.0, 14.0))
+    how = {"mirror": "left", "hold": Hold(rest=0.2)}
+    done = acts(Policy(spec_of(LIDAR, **how), weights), sheep, shepherds)
+    ahead, across = np.array((1.0, 0.3)) / np.hypot(1.0, 0.3)
+    np.testing.assert_allclose(done[:2], [(ahead, -across), (ahead, across)], atol=1e-6)
+    noisy = Policy(spec_of(LIDAR, noise=0.5, **how), weights)
+    assert np.any(acts(noisy, HOME, AROUND) != acts(Policy(spec_of(LIDAR, **how), weights), HOME, AROUND))
+    np.testing.assert_array_equal(acts(noisy, HOME, AROUND), acts(noisy, HOME, AROUND))
+
+
 @pytest.mark.parametrize("lidar", [Lidar(), Lidar(frame="goal", channels=("goal",))])
 def test_holding_needs_the_goal_ahead_and_sheep_to_see(lidar):
     with pytest.raises(PolicyError, match=r"action.hold: needs the frame 'goal' and the channel of sheep"):
@@ -132,3 +173,18 @@ def test_collie_holds_a_herd_that_its_policy_alone_would_not_press_home():
     env = ShepherdingEnv(large, lidar=collie.lidar, rewards={})
     held, loose = (run_episode(policy, env, 2)["in_goal_end"] for policy in (collie, alone))
     assert held >= 97 and loose < 80
+
+
+def test_collie_obstacles_gets_where_its_policy_alone_stays():
+    shipped = POLICIES["collie-obstacles"]()
+    assert shipped.spec.action.wander is not None
+    alone = Policy(replace(shipped.spec, action=shipped.spec.action.but(hold=None, wander=None)), shipped.weights)
+    trees = SCENARIOS["scattered"].but(layout=Scattered(density=0.05), n_flocks=2, terminate_on_success=False)
+    env = ShepherdingEnv(trees, lidar=shipped.lidar, rewards={})
+    gets, stays = (run_episode(policy, env, trial_seed(10_000, 0))["in_goal_end"] for policy in (shipped, alone))
+    assert gets >= 97 and stays < 50
+
+
+@pytest.mark.parametrize("name", ["collie", "collie-obstacles"])
+def test_shipped_policies_act_as_their_presets_say(name):
+    assert POLICIES[name]().spec.action == load_preset(name).acting()

@@ -456,6 +456,11 @@ HOSTILE_FIELDS = {
     "a frame that is none": {"action": {"frame": "moon"}},
     "an interval of nothing": {"action": {"frame": "goal", "interval": 0}},
     "never moving": {"action": {"frame": "goal", "rest": 1.0}},
+    "holding as nobody can": {"action": {"frame": "goal", "hold": {"ring": -1.0}}},
+    "holding otherwise": {"action": {"frame": "goal", "hold": {"circle": 1.0}}},
+    "holding nothing": {"action": {"frame": "goal", "hold": 3}},
+    "wandering for good": {"action": {"frame": "goal", "hold": {}, "wander": {"longest": 10**9}}},
+    "wandering without home": {"action": {"frame": "goal", "wander": {}}},
     "rewards that are a list": {"rewards": []},
     "training that is text": {"training": "yes"},
 }

@@ -12,6 +12,7 @@ from shepherd_phys.controllers import Policy, load_policy
 from shepherd_phys.controllers.hold import Hold
 from shepherd_phys.controllers.network import Actor, SectorNetwork, input_shape
 from shepherd_phys.controllers.policy_files import Acting, PolicyError
+from shepherd_phys.controllers.wander import Wander
 from shepherd_phys.envs.rewards import SCHEMES, Effort
 from shepherd_phys.envs.team import TeamVecEnv
 from shepherd_phys.flock import Reynolds
@@ -88,7 +89,7 @@ def test_torch_and_numpy_agree(name, tmp_path):
     assert means == pytest.approx(wanted, abs=1e-5) and deviations == pytest.approx(deviation, abs=1e-5)
     back = to_sb3(load_policy(tmp_path / "p.json"), critic_numbers=7)
     action, _ = back.predict({"lidar": observation, "critic": np.zeros((50, 7), np.float32)}, deterministic=True)
-    assert action == pytest.approx(np.clip(wanted, -1, 1), abs=1e-5)
+    assert action == pytest.approx(np.clip(wanted, -1, 1), abs=1e-5)  # sums in another order
 
 
 def test_the_actor_sees_its_lidar_alone_and_the_critic_the_world():
@@ -388,7 +389,9 @@ def test_a_preset_may_mix_worlds_and_price_effort():
     assert spec_of_preset(TINY.but(mirror="left")).action.mirror == "left"
     assert spec_of_preset(TINY.but(mirror="left")).training["learns_mirrored"] is False
     assert spec_of_preset(TINY.but(hold=Hold(ring=9.0))).action.hold == Hold(ring=9.0)
-    assert not {"rest", "noise", "mirror", "hold"} & set(spec_of_preset(TINY.but(hold=Hold())).training)
+    wanders = spec_of_preset(TINY.but(hold=Hold(), wander=Wander()))
+    assert wanders.action.wander == Wander()
+    assert not {"rest", "noise", "mirror", "hold", "wander"} & set(wanders.training)
     far = TINY.but(flock_distance=(4.0, 5.0), uneven=1.0).draw()(np.random.default_rng(0), 0)
     assert far.flock_distance == (4.0, 5.0) and far.flock_sizes is not None and far.n_flocks == TINY.scenario.n_flocks
     assert TINY.but(flock_distance=(4.0, 5.0)).draw() == TINY.scenario.but(flock_distance=(4.0, 5.0))
@@ -413,6 +416,7 @@ def test_a_preset_may_mix_worlds_and_price_effort():
         ("critic_first = 3", "critic_first: makes sense only with init"),
         ("learns_mirrored = true", "learns_mirrored: makes sense only with a mirror"),
         ("hold = 3", "hold: must be a table"),
+        ("[wander]", "wander: needs hold"),
         ("[hold]\nring = 0", "Hold.ring: .*greater than 0"),
         ("[hold]\n[lidar]\nframe = 'world'", "hold: needs the frame 'goal'"),
         ("reward = 'original'\nalpha = 1.0", "alpha: the reward 'original' has no occlusion term"),

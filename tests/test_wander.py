@@ -44,6 +44,14 @@ def test_who_sees_the_herd_home_stays():
     assert np.any(done[:, 1] != TEAM[:, 1])
 
 
+def test_a_walk_ends_where_the_herd_is_seen_home_and_the_patience_begins_anew():
+    wanderer = Wanderer(QUICK, np.random.default_rng(0))
+    still, home, out = np.zeros((1, 2)), np.ones(1, np.bool_), np.zeros(1, np.bool_)
+    seen = [out] * 3 + [home] * 2 + [out] * 3
+    moves = [bool(wanderer(still, now).any()) for now in seen]
+    assert moves == [False, False, True, False, False, False, False, True]  # walks take two decisions at least
+
+
 def test_walks_are_a_function_of_the_episodes_seed():
     np.testing.assert_array_equal(walked(seed=3), walked(seed=3))
     assert np.any(walked(seed=3) != walked(seed=4))

@@ -10,8 +10,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BeforeValidator, Field
 
 from shepherd_phys import mirror
-from shepherd_phys.controllers import hold
-from shepherd_phys.controllers.hold import Hold
+from shepherd_phys.controllers.hold import Hold, check_hold
 from shepherd_phys.controllers.learned import POLICIES, load_policy
 from shepherd_phys.controllers.network import (
     SectorNetwork,
@@ -81,14 +80,14 @@ class Preset(Settings):
     mirror: Side = "never"
     """Of the policy when it is deployed, and validated: which shepherds see the world in a mirror; see
     `shepherd_phys.mirror`."""
+    learns_mirrored: bool = False
+    """Whether they do so while learning, too."""
     hold: Hold | None = None
     """Of the policy when it is deployed, and validated: how a team holds the herd once it is home; see
     `shepherd_phys.controllers.hold`."""
     wander: Wander | None = None
     """Of the policy when it is deployed, and validated: what a shepherd does whose policy gets it nowhere; see
     `shepherd_phys.controllers.wander`."""
-    learns_mirrored: bool = False
-    """Whether they do so while learning, too."""
     credit: Literal["own", "team"] = "own"
     """Who is paid for a term that has shares: each shepherd by its own, or all by the mean."""
     decision_interval: int = Field(default=5, ge=1, le=1000)
@@ -162,7 +161,7 @@ class Preset(Settings):
         try:
             shapes = self.network.shapes(self.lidar)
             mirror.check(self.mirror, self.lidar)
-            hold.check(self.hold, self.lidar)
+            check_hold(self.hold, self.lidar)
             self.draw()
             self.acting()  # what no policy file can say is refused before anything is learned
         except SettingsError as error:
