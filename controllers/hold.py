@@ -44,37 +44,37 @@ class Hold(Settings):
     """Shepherds of the smallest team that holds so: fewer would press the herd out on the far side."""
 
 
-def check_hold(hold: Hold | None, lidar: Lidar) -> None:
-    """Find out whether somebody with this lidar can hold so.
+def check_sight(lidar: Lidar, field: str) -> None:
+    """Find out whether somebody with this lidar can tell that the herd is home, which ``field`` needs.
 
     Raises:
         SettingsError: the goal is not straight ahead, or no sheep are seen.
     """
-    if hold is not None and (lidar.frame != "goal" or "sheep" not in lidar.channels):
-        raise SettingsError(f"hold: needs the frame 'goal' and the channel of sheep (given: {lidar})")
+    if lidar.frame != "goal" or "sheep" not in lidar.channels:
+        raise SettingsError(f"{field}: needs the frame 'goal' and the channel of sheep (given: {lidar})")
 
 
-def outside_ring(
-    frames: NDArray[np.float32], offset: NDArray[np.int64], lidar: Lidar, hold: Hold
-) -> NDArray[np.float64]:
-    """How far outside the ring each shepherd stands [m], below 0 inside; NaN for whoever sees no herd that is home.
+def home_herd(frames: NDArray[np.float32], offset: NDArray[np.int64], lidar: Lidar, home: float) -> NDArray[np.float64]:
+    """How far the goal's centre is (P,) [m] for those who see the herd home; NaN for others.
+
+    They see the goal from outside, and sheep, none of them further outside its border than ``home``.
 
     Args:
         frames: (P, stack, channels, beams) proximities of all beams in the world frame, newest last.
         offset: (P,) the beams that point at the goal.
         lidar: the settings.
-        hold: the settings.
+        home: [m].
     """
-    outside = np.full(len(frames), np.nan)
-    _outside_ring(
+    distances = np.full(len(frames), np.nan)
+    _home_herd(
         frames[:, -1], lidar.channels.index("goal"), lidar.channels.index("sheep"), lidar.goal_range, lidar.range,
-        beam_directions(lidar.beams), offset, hold.ring, hold.home, outside,
+        beam_directions(lidar.beams), offset, home, distances,
     )  # fmt: skip
-    return outside
+    return distances
 
 
 @njit(cache=True, error_model="numpy")
-def _outside_ring(frame, goal, sheep, goal_range, sheep_range, directions, offset, ring, home, out):  # type: ignore[no-untyped-def]
+def _home_herd(frame, goal, sheep, goal_range, sheep_range, directions, offset, home, out):  # type: ignore[no-untyped-def]
     """Of the rows ``goal`` and ``sheep`` of (P, channels, beams).
 
     A disc of radius r whose centre is d away looks 2 a wide, sin a = r / d, and its nearest point is d - r away. Its
@@ -101,7 +101,7 @@ def _outside_ring(frame, goal, sheep, goal_range, sheep_range, directions, offse
         x, y = centre * directions[0, offset[p]], centre * directions[1, offset[p]]
         for k in range(beams):
             if frame[p, sheep, k] > 0.0:
-                out[p] = centre - ring
+                out[p] = centre
                 d = sheep_range * (1.0 - frame[p, sheep, k])
                 if math.hypot(d * directions[0, k] - x, d * directions[1, k] - y) > far:
                     out[p] = math.nan

@@ -17,7 +17,7 @@ from shepherd_phys.lidar import Lidar, beam_directions
 from shepherd_phys.observation import observe
 from shepherd_phys.state import WorldState
 
-from .hold import outside_ring
+from .hold import home_herd
 from .network import Actor
 from .policy_files import PolicySpec, read_policy
 from .wander import Wanderer
@@ -109,12 +109,13 @@ class Policy:
             action = mean + self._chance * deviation if acting.noise else mean
             if self._mirrored is not None:
                 action = mirror.meant(action, self._mirrored)
-            hold, nobody = acting.hold, self._nobody
-            outside = nobody if hold is None else outside_ring(frames, self._offset, self._observed, hold)
-            held = nobody if hold is None or n < hold.team else outside
-            self._action = _wanted(action, self._offset, self._directions, acting.rest, held, self._limits)
-            if self._wanderer is not None:
-                self._action = self._wanderer(self._action, np.isfinite(outside))
+            hold, wander, outside = acting.hold, acting.wander, self._nobody
+            if hold is not None and n >= hold.team:
+                outside = home_herd(frames, self._offset, self._observed, hold.home) - hold.ring
+            self._action = _wanted(action, self._offset, self._directions, acting.rest, outside, self._limits)
+            if self._wanderer is not None and wander is not None:
+                home = np.isfinite(home_herd(frames, self._offset, self._observed, wander.home))
+                self._action = self._wanderer(self._action, home)
         return self._action.copy()
 
     def to_dict(self) -> dict[str, Any]:

@@ -28,7 +28,7 @@ from shepherd_phys.mirror import Side
 from shepherd_phys.scenario import Scenario
 from shepherd_phys.settings import Settings, SettingsError, settings, tagged, untagged
 
-from .hold import Hold, check_hold
+from .hold import Hold, check_sight
 from .network import ARCHITECTURES, SectorNetwork, bytes_of, without_scatter
 from .wander import Wander
 
@@ -71,10 +71,6 @@ class Acting(Settings):
     wander: Wander | None = None
     """What a shepherd does whose policy gets it nowhere; none: it waits."""
 
-    def __post_init__(self) -> None:
-        if self.wander is not None and self.hold is None:
-            raise ValueError("wander: needs hold, which tells who stands still for good reason (given: hold = none)")
-
 
 @dataclass(frozen=True)
 class PolicySpec:
@@ -96,7 +92,9 @@ class PolicySpec:
             raise PolicyError(f"action.frame: must be the lidar's, {self.lidar.frame!r} (given: {self.action.frame!r})")
         try:
             mirror.check(self.action.mirror, self.lidar)
-            check_hold(self.action.hold, self.lidar)
+            for name in ("hold", "wander"):
+                if getattr(self.action, name) is not None:
+                    check_sight(self.lidar, name)
         except SettingsError as error:
             raise PolicyError(f"action.{error}") from None
 

@@ -21,6 +21,8 @@ class Wander(Settings):
     of the deployed policy; the figures given here are for one each control step of 0.2 s.
     """  # noqa: D205
 
+    home: float = Field(default=3.0, ge=0)
+    """So far outside the goal's border [m] the point that is seen of a sheep is still home."""
     memory: float = Field(default=0.02, gt=0, le=1)
     """Part that a decision makes of the mean; at 0.02 it reaches some 50 decisions back: ten seconds."""
     least: float = Field(default=0.2, gt=0, le=1)

@@ -93,7 +93,7 @@ def find_reward(name: str) -> Scheme | str:
     own = imported(name, "reward")
     if not isinstance(own, Mapping):
         raise SettingsError(
-            f"reward: {name}: needs a scheme, a dict of name -> (weight, term) (it is a {type(own).__name__})"
+            f"reward: {name}: needs a scheme, a dict of name -> (weight, term) (its type: {type(own).__name__})"
         )
     try:
         return checked(own)
@@ -163,7 +163,7 @@ def find_class(name: str, known: dict[str, type[Any]], where: str, or_function: 
     own = imported(name, where)
     if not (inspect.isclass(own) or (or_function and inspect.isroutine(own))):
         wanted = "a class or a function" if or_function else "a class"
-        raise SettingsError(f"{where}: {name}: needs {wanted} (it is a {type(own).__name__})")
+        raise SettingsError(f"{where}: {name}: needs {wanted} (its type: {type(own).__name__})")
     return own
 
 

@@ -125,7 +125,7 @@ def test_a_flock_model_of_a_users_own_may_be_a_function(folder, capsys):
     shell(f"evaluate {words}still")
     assert [(row["cohesion"], row["ever_in_goal"]) for row in rows()] == [("", "0.0")]
     assert evaluate([*f"{words}STILL".split(), "--out", "other"]) == 2
-    assert "flock: mine:STILL: needs a class or a function (it is a int)" in capsys.readouterr().err
+    assert "flock: mine:STILL: needs a class or a function (its type: int)" in capsys.readouterr().err
     sys.modules.pop("mine")
 
 
@@ -192,7 +192,7 @@ FOGGY = SCENARIOS["small"].but(layout=fog)
         ("--reward my_file:BLAND", "reward: my_file:BLAND: rewards['bland']: needs a number and a term"),
         ("--reward my_file:SOUR", "OSError: no taste (my_file.py:"),
         ("--reward sweet", "reward: 'sweet' is not one of original, any, wild"),
-        ("--body my_file:number", "body: my_file:number: needs a class (it is a int)"),
+        ("--body my_file:number", "body: my_file:number: needs a class (its type: int)"),
         ("--body my_file:Nobody", "body: my_file:Nobody: module 'my_file' has no 'Nobody'"),
         ("--body Tank", "body: 'Tank' is unknown; there are DifferentialDrive, Disc, Flyer"),
         ("--flock my_file:Deaf", "flock: my_file:Deaf: lacks velocities"),

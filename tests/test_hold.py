@@ -12,7 +12,7 @@ from test_learned import SMALL, random_weights, spec_of
 
 from shepherd_phys.controllers import POLICIES, Policy
 from shepherd_phys.controllers.evaluation import run_episode, trial_seed
-from shepherd_phys.controllers.hold import Hold, outside_ring
+from shepherd_phys.controllers.hold import Hold, home_herd
 from shepherd_phys.controllers.policy_files import PolicyError
 from shepherd_phys.envs import ShepherdingEnv
 from shepherd_phys.layouts import Scattered
@@ -34,46 +34,45 @@ def frames(sheep, shepherds, goal=(0.0, 0.0), lidar=LIDAR, goal_radius=2.5):
     return seen, observe(seen, np.zeros(len(shepherds), np.int64), lidar)[1]
 
 
-def outside(sheep, shepherds, hold=None, **how):
-    return outside_ring(*frames(sheep, shepherds, **how), LIDAR, hold or Hold())
+def herd(sheep, shepherds, home=3.0, **how):
+    return home_herd(*frames(sheep, shepherds, **how), LIDAR, home)
 
 
 AROUND = ((14.0, 0.0), (0.0, -8.5), (-9.0, 12.0))
 
 
 @pytest.mark.parametrize("goal_radius", [1.5, 2.5, 3.54])
-def test_how_far_outside_the_ring_one_stands_by_how_wide_the_goal_looks(goal_radius):
-    told = outside(((0.0, 0.0),), AROUND, goal_radius=goal_radius)
-    np.testing.assert_allclose(told, [3.5, -2.0, 4.5], atol=0.15)  # beams are 0.7 degrees apart
-    assert outside(((0.0, 0.0),), AROUND, Hold(ring=12.0), goal_radius=goal_radius) == pytest.approx(told - 1.5)
+def test_how_far_the_goals_centre_is_by_how_wide_it_looks(goal_radius):
+    told = herd(((0.0, 0.0),), AROUND, goal_radius=goal_radius)
+    np.testing.assert_allclose(told, [14.0, 8.5, 15.0], atol=0.15)  # beams are 0.7 degrees apart
 
 
 def test_only_those_hold_who_see_no_sheep_that_is_not_home():
-    assert np.isfinite(outside(HOME, AROUND)).all()
-    assert np.isnan(outside((*HOME, (0.0, -6.0)), AROUND)).all()
-    assert np.isfinite(outside((*HOME, (0.0, -6.0)), AROUND, Hold(home=4.0))).all()
+    assert np.isfinite(herd(HOME, AROUND)).all()
+    assert np.isnan(herd((*HOME, (0.0, -6.0)), AROUND)).all()
+    assert np.isfinite(herd((*HOME, (0.0, -6.0)), AROUND, 4.0)).all()
     # a sheep in the shadow of another is not seen: the first shepherd has them in a line, the others do not
-    shadow = outside(((2.0, 0.0), (-6.0, 0.0)), AROUND)
+    shadow = herd(((2.0, 0.0), (-6.0, 0.0)), AROUND)
     assert np.isfinite(shadow).tolist() == [True, False, False]
 
 
 def test_nobody_holds_inside_the_goal_or_without_sight_of_it_or_of_sheep():
-    assert np.isfinite(outside(HOME, ((14.0, 0.0), (1.0, 0.0), (0.0, 9.0)))).tolist() == [True, False, True]
+    assert np.isfinite(herd(HOME, ((14.0, 0.0), (1.0, 0.0), (0.0, 9.0)))).tolist() == [True, False, True]
     seen, offset = frames(HOME, AROUND)
     seen[1, :, LIDAR.channels.index("goal")] = 0.0
-    assert np.isfinite(outside_ring(seen, offset, LIDAR, Hold())).tolist() == [True, False, True]
+    assert np.isfinite(home_herd(seen, offset, LIDAR, 3.0)).tolist() == [True, False, True]
     seen, offset = frames(HOME, AROUND)
     seen[1, :, LIDAR.channels.index("sheep")] = 0.0
-    assert np.isfinite(outside_ring(seen, offset, LIDAR, Hold())).tolist() == [True, False, True]
+    assert np.isfinite(home_herd(seen, offset, LIDAR, 3.0)).tolist() == [True, False, True]
 
 
 def test_lost_beams_change_it_little():
     seen, offset = frames(HOME, AROUND)
-    whole = outside_ring(seen, offset, LIDAR, Hold())
+    whole = home_herd(seen, offset, LIDAR, 3.0)
     for seed in range(20):
         lost = (seen * (np.random.default_rng(seed).random(seen.shape) > 0.1)).astype(np.float32)
         turned = observe(lost, np.zeros(3, np.int64), LIDAR)[1]
-        assert outside_ring(lost, turned, LIDAR, Hold()) == pytest.approx(whole, abs=0.4)
+        assert home_herd(lost, turned, LIDAR, 3.0) == pytest.approx(whole, abs=0.4)
 
 
 def test_it_goes_by_the_newest_frame_whatever_the_channels_and_sectors():
@@ -84,9 +83,9 @@ def test_it_goes_by_the_newest_frame_whatever_the_channels_and_sectors():
         LIDAR.but(stack=2, channels=("sheep", "shepherds", "goal", "obstacles")),
     ):
         (newest, _), (older, _) = (frames(sheep, AROUND, lidar=lidar) for sheep in (HOME, (*HOME, (0.0, -6.0))))
-        told = outside_ring(np.concatenate((older, newest), axis=1), offset, lidar, Hold())
-        np.testing.assert_array_equal(told, outside_ring(whole, offset, LIDAR, Hold()))
-        assert np.isnan(outside_ring(np.concatenate((newest, older), axis=1), offset, lidar, Hold())).all()
+        told = home_herd(np.concatenate((older, newest), axis=1), offset, lidar, 3.0)
+        np.testing.assert_array_equal(told, home_herd(whole, offset, LIDAR, 3.0))
+        assert np.isnan(home_herd(np.concatenate((newest, older), axis=1), offset, lidar, 3.0)).all()
 
 
 def test_on_the_border_half_of_the_beams_see_the_goal_and_nobody_holds():
@@ -94,9 +93,9 @@ def test_on_the_border_half_of_the_beams_see_the_goal_and_nobody_holds():
     row = seen[0, 0, LIDAR.channels.index("goal")]
     row[:] = 0.0
     row[:255] = 0.999
-    assert np.isfinite(outside_ring(seen, offset, LIDAR, Hold(home=40.0))[0])
+    assert np.isfinite(home_herd(seen, offset, LIDAR, 40.0)[0])
     row[255] = 0.999
-    assert np.isnan(outside_ring(seen, offset, LIDAR, Hold(home=40.0))[0])
+    assert np.isnan(home_herd(seen, offset, LIDAR, 40.0)[0])
 
 
 @hypothesis_settings(max_examples=30, deadline=None)
@@ -104,7 +103,7 @@ def test_on_the_border_half_of_the_beams_see_the_goal_and_nobody_holds():
 def test_it_is_the_same_wherever_the_scene_lies_and_however_it_is_turned(angle, x, y):
     turned = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     moved = [np.array(points) @ turned.T + (x, y) for points in (HOME, AROUND)]
-    assert outside(*moved, goal=(x, y)) == pytest.approx(outside(HOME, AROUND), abs=0.3)
+    assert herd(*moved, goal=(x, y)) == pytest.approx(herd(HOME, AROUND), abs=0.3)
 
 
 def acts(policy, sheep, shepherds):

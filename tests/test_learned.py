@@ -459,8 +459,7 @@ HOSTILE_FIELDS = {
     "holding as nobody can": {"action": {"frame": "goal", "hold": {"ring": -1.0}}},
     "holding otherwise": {"action": {"frame": "goal", "hold": {"circle": 1.0}}},
     "holding nothing": {"action": {"frame": "goal", "hold": 3}},
-    "wandering for good": {"action": {"frame": "goal", "hold": {}, "wander": {"longest": 10**9}}},
-    "wandering without home": {"action": {"frame": "goal", "wander": {}}},
+    "wandering for good": {"action": {"frame": "goal", "wander": {"longest": 10**9}}},
     "rewards that are a list": {"rewards": []},
     "training that is text": {"training": "yes"},
 }

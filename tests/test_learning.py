@@ -416,7 +416,7 @@ def test_a_preset_may_mix_worlds_and_price_effort():
         ("critic_first = 3", "critic_first: makes sense only with init"),
         ("learns_mirrored = true", "learns_mirrored: makes sense only with a mirror"),
         ("hold = 3", "hold: must be a table"),
-        ("[wander]", "wander: needs hold"),
+        ("[wander]\n[lidar]\nframe = 'world'", "wander: needs the frame 'goal'"),
         ("[hold]\nring = 0", "Hold.ring: .*greater than 0"),
         ("[hold]\n[lidar]\nframe = 'world'", "hold: needs the frame 'goal'"),
         ("reward = 'original'\nalpha = 1.0", "alpha: the reward 'original' has no occlusion term"),

@@ -619,7 +619,7 @@ MISTAKES = [
     ),
     ("--body mine:Stone", "body: mine:Stone: lacks build, follow"),
     ("--body mine:Needy", "body: mine:Needy: cannot be made without arguments"),
-    ("--body mine:number", "body: mine:number: needs a class (it is a int)"),
+    ("--body mine:number", "body: mine:number: needs a class (its type: int)"),
     ("--flock nobody", "flock: 'nobody' is unknown; there are"),
     ("--flock mine:Stone", "flock: mine:Stone: lacks velocities"),
     ("--flock mine:Moody", "mine:Moody: cannot be written, because it does not say what its parameters are"),

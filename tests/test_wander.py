@@ -6,8 +6,9 @@ from test_hold import AROUND, HOME, LIDAR, frames
 from test_learned import SMALL, random_weights, spec_of
 
 from shepherd_phys.controllers import Policy
-from shepherd_phys.controllers.hold import Hold
+from shepherd_phys.controllers.policy_files import PolicyError
 from shepherd_phys.controllers.wander import Wander, Wanderer
+from shepherd_phys.lidar import Lidar
 from shepherd_phys.scenario import Scenario
 from shepherd_phys.settings import SettingsError
 from shepherd_phys.world import World
@@ -61,7 +62,7 @@ def test_a_policy_wanders_where_its_team_is_stuck_and_not_where_the_herd_is_home
     weights = random_weights(SMALL, LIDAR)
     weights["action.weight"] *= 0.0
     weights["action.bias"] *= 0.0
-    policy = Policy(spec_of(LIDAR, hold=Hold(ring=20.0), wander=Wander(after=4)), weights)
+    policy = Policy(spec_of(LIDAR, wander=Wander(after=4)), weights)
     state = World(Scenario()).reset(0)
 
     def acts(sheep, seed=0):
@@ -73,13 +74,12 @@ def test_a_policy_wanders_where_its_team_is_stuck_and_not_where_the_herd_is_home
     stuck = acts((*HOME, (0.0, -20.0)))
     assert not stuck[:3].any() and np.hypot(*stuck[3:].reshape(-1, 2).T) == pytest.approx(1.0)
     np.testing.assert_array_equal(stuck, acts((*HOME, (0.0, -20.0))))
-    # a team that is too small to hold knows as well when all are home
-    policy = Policy(spec_of(LIDAR, hold=Hold(ring=20.0, team=4), wander=Wander(after=4)), weights)
-    assert not acts(HOME).any()
+    policy = Policy(spec_of(LIDAR, wander=Wander(after=4, home=2.0)), weights)
+    assert acts(HOME).any()  # one of them is 2.7 m from the border
 
 
 def test_wrong_settings_are_refused():
     with pytest.raises(SettingsError, match=r"Wander: longest: must be at least shortest, 9 \(given: 3\)"):
         Wander(shortest=9, longest=3)
-    with pytest.raises(SettingsError, match="Acting: wander: needs hold"):
-        spec_of(LIDAR, wander=Wander())
+    with pytest.raises(PolicyError, match=r"action.wander: needs the frame 'goal' and the channel of sheep"):
+        spec_of(Lidar(), wander=Wander())

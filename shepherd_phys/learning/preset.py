@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BeforeValidator, Field
 
 from shepherd_phys import mirror
-from shepherd_phys.controllers.hold import Hold, check_hold
+from shepherd_phys.controllers.hold import Hold, check_sight
 from shepherd_phys.controllers.learned import POLICIES, load_policy
 from shepherd_phys.controllers.network import (
     SectorNetwork,
@@ -161,7 +161,9 @@ class Preset(Settings):
         try:
             shapes = self.network.shapes(self.lidar)
             mirror.check(self.mirror, self.lidar)
-            check_hold(self.hold, self.lidar)
+            for name in ("hold", "wander"):
+                if getattr(self, name) is not None:
+                    check_sight(self.lidar, name)
             self.draw()
             self.acting()  # what no policy file can say is refused before anything is learned
         except SettingsError as error:
