@@ -43,6 +43,10 @@ class Hold(Settings):
     team: int = Field(default=3, ge=1, le=1000)
     """Shepherds of the smallest team that holds so: fewer would press the herd out on the far side."""
 
+    def __post_init__(self) -> None:
+        if self.inside is not None and self.inside > self.ring:
+            raise ValueError(f"inside: must be no more than ring, {self.ring} (given: {self.inside})")
+
 
 def check_sight(lidar: Lidar, field: str) -> None:
     """Find out whether somebody with this lidar can tell that the herd is home, which ``field`` needs.

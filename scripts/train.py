@@ -89,7 +89,7 @@ def main(argv: Sequence[str]) -> int:
     from shepherd_phys.learning.ppo import TrainingError
     from shepherd_phys.learning.run import train
     from shepherd_phys.learning.validation import ValidationError
-    from shepherd_phys.workers import WorkersError
+    from shepherd_phys.workers import WorkersError, explain
 
     interval = preset.checkpoint_rollouts * preset.rollout_steps
     if preset.budget < interval:
@@ -110,6 +110,11 @@ def main(argv: Sequence[str]) -> int:
             return fail(PROG, error, 2)
         except (CheckpointError, TrainingError, ValidationError, WorkerError, WorkersError, OSError) as error:
             return fail(PROG, error, 1)
+        except Exception as error:
+            notes = getattr(error, "__notes__", ())
+            if not notes:  # what a world of this process raised says in which: a user's body, flock model or reward
+                raise
+            return fail(PROG, f"{explain(error)}, {', '.join(notes)}", 1)
         except KeyboardInterrupt:
             return fail(PROG, f"stopped: --resume --out {folder} goes on from the last checkpoint", 130)
     if best is not None:

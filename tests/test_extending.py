@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import subprocess
 import sys
 import tomllib
@@ -236,3 +237,17 @@ def test_a_preset_with_neighbours_to_draw_draws_none_for_a_flock_model_without(f
     assert Preset.from_toml("runs/x/preset.toml").n_neighbours is None
     with open("runs/x/validation.csv", newline="", encoding="utf-8") as file:
         assert {row["cohesion"] for row in csv.DictReader(file)} == {""}
+
+
+def test_a_body_that_fails_while_learning_is_one_line(folder, capsys):
+    Path("late.py").write_text(
+        "from my_file import Hexapod\n\n\nclass Late(Hexapod):\n    made = 0\n\n"
+        "    def follow(self, *call):\n        Late.made += 1\n        if Late.made > 300:\n"
+        "            raise ZeroDivisionError('tired')\n        return super().follow(*call)\n"
+    )
+    Path("hexapod.toml").write_text(tomli_w.dumps({**TINY, "budget": 160}))
+    assert train(["--preset", "hexapod.toml", "--body", "late:Late", "--out", "runs/x", "--workers", "1"]) == 1
+    *_, line = capsys.readouterr().err.splitlines()
+    assert re.match(
+        r"shepherd-phys train: ZeroDivisionError: tired \(late.py:10\), in world \d, episode seed \d+$", line
+    )

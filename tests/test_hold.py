@@ -20,6 +20,7 @@ from shepherd_phys.learning.preset import load_preset
 from shepherd_phys.lidar import Lidar
 from shepherd_phys.observation import encode, observe
 from shepherd_phys.scenario import SCENARIOS, Scenario
+from shepherd_phys.settings import SettingsError
 from shepherd_phys.world import World
 
 LIDAR = Lidar(stack=1, frame="goal")
@@ -182,6 +183,12 @@ def test_collie_obstacles_gets_where_its_policy_alone_stays():
     env = ShepherdingEnv(trees, lidar=shipped.lidar, rewards={})
     gets, stays = (run_episode(policy, env, trial_seed(10_000, 0))["in_goal_end"] for policy in (shipped, alone))
     assert gets >= 97 and stays < 50
+
+
+def test_nobody_can_stand_further_inside_a_ring_than_its_centre():
+    assert Hold(ring=9.0, inside=9.0).inside == 9.0
+    with pytest.raises(SettingsError, match=r"Hold: inside: must be no more than ring, 9.0 \(given: 20.0\)"):
+        Hold(ring=9.0, inside=20.0)
 
 
 @pytest.mark.parametrize("name", ["collie", "collie-obstacles"])
