@@ -421,7 +421,11 @@ def test_a_preset_may_mix_worlds_and_price_effort():
         ("[hold]\n[lidar]\nframe = 'world'", "hold: needs the frame 'goal'"),
         ("reward = 'original'\nalpha = 1.0", "alpha: the reward 'original' has no occlusion term"),
         ("lidar = 3", "lidar: must be a table"),
-        ("scenario = 'moon'", "scenario: must be a table"),
+        ("scenario = 3", "scenario: must be a table"),
+        (
+            "scenario = 'scaterred'",
+            "scenario: 'scaterred' is neither a table nor one of .*; did you mean scattered.;? ",
+        ),
         ("n_flocks = [5, 2]", "smaller number comes first"),
         ("[lidar]\nlayout = 'paper'", "takes 'rows'"),
         ("[network]\ngroup = 7", "must divide"),

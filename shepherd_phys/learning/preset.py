@@ -344,18 +344,24 @@ class Preset(Settings):
         values, classes = dict(table), tuple(classes)
         if isinstance(values.get("reward"), Mapping):
             values["reward"] = from_table(values["reward"], classes, "Preset.reward")
-        if isinstance(values.get("scenario"), str) and values["scenario"] in SCENARIOS:
-            values["scenario"] = SCENARIOS[values["scenario"]]
+        name = values.get("scenario")
+        if isinstance(name, str):
+            if name not in SCENARIOS:
+                raise SettingsError(
+                    f"Preset.scenario: {name!r} is neither a table nor one of {', '.join(SCENARIOS)} (a file or "
+                    f"module:Name of your own is given as --scenario){meant(name, SCENARIOS)}"
+                )
+            values["scenario"] = SCENARIOS[name]
         if isinstance(values.get("scenario"), Mapping):
             values["scenario"] = Scenario.from_dict(values["scenario"], classes)
-        for name, made in PARTS.items():
-            if name in values and not isinstance(values[name], Scenario):
-                if not isinstance(values[name], Mapping):
-                    raise SettingsError(f"Preset.{name}: must be a table (given: {values[name]!r})")
-                own = values[name]
-                if name == "lidar":  # by now the scenario has been made
+        for part, made in PARTS.items():
+            if part in values and not isinstance(values[part], Scenario):
+                if not isinstance(values[part], Mapping):
+                    raise SettingsError(f"Preset.{part}: must be a table (given: {values[part]!r})")
+                own = values[part]
+                if part == "lidar":  # by now the scenario has been made
                     own = {"channels": _channels(**values), **own}
-                values[name] = made(own)
+                values[part] = made(own)
         return cls(**values)
 
     @classmethod
