@@ -424,7 +424,7 @@ def test_a_preset_may_mix_worlds_and_price_effort():
         ("scenario = 3", "scenario: must be a table"),
         (
             "scenario = 'scaterred'",
-            "scenario: 'scaterred' is neither a table nor one of .*; did you mean scattered.;? ",
+            "scenario: .scaterred. is neither a table nor one of .*; did you mean scattered",
         ),
         ("n_flocks = [5, 2]", "smaller number comes first"),
         ("[lidar]\nlayout = 'paper'", "takes 'rows'"),
