@@ -56,7 +56,6 @@ class Policy:
         hold = spec.action.hold
         deep = math.inf if hold is None or hold.inside is None else hold.inside
         self._limits = (0.0 if hold is None else hold.rest, deep)
-        self._nobody = np.zeros(0)
         self._chance = np.zeros((0, 2))
         self._offset: NDArray[np.int64] | None = None
         self._action: NDArray[np.float64] | None = None
@@ -93,7 +92,7 @@ class Policy:
         if n == 0:
             return np.zeros((0, 2))
         if self._offset is None:
-            self._offset, self._nobody = np.zeros(n, np.int64), np.full(n, np.nan)
+            self._offset = np.zeros(n, np.int64)
         acting = self.spec.action
         frames = observation.reshape(n, *self._frames) if self._rolls else observation
         if self._rolls:
@@ -109,12 +108,12 @@ class Policy:
             action = mean + self._chance * deviation if acting.noise else mean
             if self._mirrored is not None:
                 action = mirror.meant(action, self._mirrored)
-            hold, wander, outside = acting.hold, acting.wander, self._nobody
+            hold, outside = acting.hold, np.full(n, np.nan)
             if hold is not None and n >= hold.team:
                 outside = home_herd(frames, self._offset, self._observed, hold.home) - hold.ring
             self._action = _wanted(action, self._offset, self._directions, acting.rest, outside, self._limits)
-            if self._wanderer is not None and wander is not None:
-                home = np.isfinite(home_herd(frames, self._offset, self._observed, wander.home))
+            if self._wanderer is not None:
+                home = np.isfinite(home_herd(frames, self._offset, self._observed, self._wanderer.settings.home))
                 self._action = self._wanderer(self._action, home)
         return self._action.copy()
 

@@ -71,6 +71,19 @@ class Acting(Settings):
     wander: Wander | None = None
     """What a shepherd does whose policy gets it nowhere; none: it waits."""
 
+    def check(self, lidar: Lidar) -> None:
+        """Find out whether somebody with this lidar can act so.
+
+        Raises:
+            SettingsError: it cannot; the message begins with the field.
+        """
+        if self.frame != lidar.frame:
+            raise SettingsError(f"frame: must be the lidar's, {lidar.frame!r} (given: {self.frame!r})")
+        mirror.check(self.mirror, lidar)
+        for name in ("hold", "wander"):
+            if getattr(self, name) is not None:
+                check_sight(lidar, name)
+
 
 @dataclass(frozen=True)
 class PolicySpec:
@@ -88,13 +101,8 @@ class PolicySpec:
     """How it was trained, as plain data."""
 
     def __post_init__(self) -> None:
-        if self.action.frame != self.lidar.frame:
-            raise PolicyError(f"action.frame: must be the lidar's, {self.lidar.frame!r} (given: {self.action.frame!r})")
         try:
-            mirror.check(self.action.mirror, self.lidar)
-            for name in ("hold", "wander"):
-                if getattr(self.action, name) is not None:
-                    check_sight(self.lidar, name)
+            self.action.check(self.lidar)
         except SettingsError as error:
             raise PolicyError(f"action.{error}") from None
 

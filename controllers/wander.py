@@ -48,7 +48,7 @@ class Wanderer:
     """
 
     def __init__(self, settings: Wander, rng: np.random.Generator) -> None:
-        self._settings = settings
+        self.settings = settings
         self._rng = rng
         self._mean: NDArray[np.float64] | None = None
         self._short = np.zeros(0, np.int64)
@@ -57,7 +57,7 @@ class Wanderer:
 
     def __call__(self, wanted: NDArray[np.float64], home: NDArray[np.bool_]) -> NDArray[np.float64]:
         """What the team does (P, 2) where its policy wants ``wanted`` (P, 2); who sees the herd ``home`` (P,) stays."""
-        own = self._settings
+        own = self.settings
         if self._mean is None:
             n = len(wanted)
             self._mean, self._way = wanted.copy(), np.zeros((n, 2))

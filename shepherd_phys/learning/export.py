@@ -25,17 +25,7 @@ from shepherd_phys.learning.preset import Preset
 def spec_of(preset: Preset, shepherd_steps: int = 0) -> PolicySpec:
     """What the file of a policy trained by ``preset`` says beside its weights."""
     training = preset.to_dict()
-    elsewhere = (
-        "scenario",
-        "lidar",
-        "network",
-        "reward",
-        "effort",
-        "effort_team",
-        "gathered",
-        "alpha",
-        "credit",
-    )
+    elsewhere = ("scenario", "lidar", "network", "reward", "effort", "effort_team", "gathered", "alpha", "credit")
     for name in (*elsewhere, "rest", "noise", "mirror", "hold", "wander"):
         training.pop(name, None)
     if preset.init is not None:

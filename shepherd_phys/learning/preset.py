@@ -9,8 +9,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field
 
-from shepherd_phys import mirror
-from shepherd_phys.controllers.hold import Hold, check_sight
+from shepherd_phys.controllers.hold import Hold
 from shepherd_phys.controllers.learned import POLICIES, load_policy
 from shepherd_phys.controllers.network import (
     SectorNetwork,
@@ -160,12 +159,8 @@ class Preset(Settings):
             )
         try:
             shapes = self.network.shapes(self.lidar)
-            mirror.check(self.mirror, self.lidar)
-            for name in ("hold", "wander"):
-                if getattr(self, name) is not None:
-                    check_sight(self.lidar, name)
             self.draw()
-            self.acting()  # what no policy file can say is refused before anything is learned
+            self.acting().check(self.lidar)  # what no policy file can say is refused before anything is learned
         except SettingsError as error:
             raise ValueError(str(error)) from None
         self._check_size(bytes_of(shapes))
