@@ -332,7 +332,7 @@ def test_variants_differ_in_what_they_say():
     plain = {name: preset.to_dict() for name, preset in variants().items()}
     assert {preset.lidar.sectors for preset in variants().values()} == {64}
     assert {preset.network for preset in variants().values()} == {load_preset("fast").network}
-    assert plain["fast"] == load_preset("fast").to_dict()
+    assert plain["fast"] == load_preset("fast").but(wander=None).to_dict()
     less = {name: changes(plain["fast"], other) for name, other in plain.items() if name.startswith("fast-")}
     gamma = less["fast-every-step"].pop("ppo.gamma")
     assert less["fast-every-step"].pop("ppo.gae_lambda") ** 5 == pytest.approx(0.95)

@@ -56,7 +56,7 @@ Fractions = Annotated[
 
 @settings
 class Preset(Settings):
-    """A training run. The defaults are what trains fast; the budget and rates are in shepherd-steps (control steps
+    """A training run. The defaults are what trains fast, less its wandering; the budget and rates are in shepherd-steps (control steps
     times shepherds).
     """  # noqa: D205
 
