@@ -201,15 +201,10 @@ def _spec(table: Mapping[str, Any], classes: Iterable[Any]) -> PolicySpec:
         scenario=Scenario.from_dict(_table(table, "scenario"), classes),
         lidar=Lidar(**_table(table, "lidar")),
         network=_network(_table(table, "network")),
-        action=_acting(_table(table, "action")),
+        action=Acting(**_table(table, "action")),
         rewards=_table(table, "rewards"),
         training=_table(table, "training"),
     )
-
-
-def _acting(table: Mapping[str, Any]) -> Acting:
-    parts = {name: made for name, made in (("hold", Hold), ("wander", Wander)) if name in table}
-    return Acting(**{**table, **{name: made(**_table(table, name)) for name, made in parts.items()}})
 
 
 def _network(table: Mapping[str, Any]) -> SectorNetwork:

@@ -14,6 +14,7 @@ from shepherd_phys.controllers.summary import DELIVERED, paired_differences, sum
 from shepherd_phys.imperfections import Imperfections
 from shepherd_phys.layouts import Scattered
 
+from .command import counted
 from .pages import study_page
 from .points import points, table, tasks
 from .studies import Reported, Result
@@ -112,7 +113,7 @@ STUDIES: dict[str, Study] = {
         "Reynolds' sheep",
         "Sheep that move by Reynolds' rules, which no policy was trained with and no heuristic was tuned on.",
         {
-            f"{k} flock{'s' * (k > 1)}": {"flock": "Reynolds", "cohesion": (), "flocks": (k,)}
+            counted(k, "flock"): {"flock": "Reynolds", "cohesion": (), "flocks": (k,)}
             for k in (1, 2, 5)
         },
         (*HEURISTICS, "wild", "collie"),

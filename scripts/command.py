@@ -168,6 +168,11 @@ def clock(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{seconds:02d}"
 
 
+def counted(n: int, thing: str) -> str:
+    """So many of them: ``1 flock``, ``2 flocks``."""
+    return f"{n} {thing}{'s' if n > 1 else ''}"
+
+
 def _one_line(box: str) -> str:
     """What a box of tyro's says, without its title, frame and the help below the message's rule.
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from shepherd_phys.controllers.curves import WINDOW, Row, curve_of, final_value, levels_off_at
 from shepherd_phys.learning.studies import HOME
 
-from .command import clock
+from .command import clock, counted
 from .pages import line
 
 Scheme = tuple[str, str]
@@ -29,7 +29,16 @@ def figure1_page(curves: Sequence[Row], validations: Sequence[Row], home: Sequen
         home: rows of ``time-to-home.csv``, of runs of `TIMED_SCHEME` that were trained alone.
     """
     flocks = _flocks(validations)
-    head = ["recipe", "reward", "seeds", "final reward", "levels off at", *map(_flocks_word, flocks), "rate", "time"]
+    head = [
+        "recipe",
+        "reward",
+        "seeds",
+        "final reward",
+        "levels off at",
+        *(counted(n, "flock") for n in flocks),
+        "rate",
+        "time",
+    ]
     lines = [
         "# Figure 1: learning curves",
         "",
@@ -83,7 +92,7 @@ def _levels_off(at: float | None, lasts: Sequence[Row]) -> str:
 def _home(home: Sequence[Row]) -> list[str]:
     """The table of the time to home."""
     flocks = sorted({row["n_flocks"] for row in home if row["n_flocks"] is not None})
-    head = ["seed", "M shepherd-steps", "time", *map(_flocks_word, flocks)]
+    head = ["seed", "M shepherd-steps", "time", *(counted(n, "flock") for n in flocks)]
     lines = [
         "",
         "**Time to home**",
@@ -115,7 +124,7 @@ def ablations_page(curves: Sequence[Row], validations: Sequence[Row]) -> str:
         validations: rows of ``ablations-validation.csv``.
     """
     flocks = _flocks(validations)
-    head = ["variant", "seeds", "M shepherd-steps", "decisions", *map(_flocks_word, flocks), "final reward",
+    head = ["variant", "seeds", "M shepherd-steps", "decisions", *(counted(n, "flock") for n in flocks), "final reward",
             "half in at"]  # fmt: skip
     lines = [
         "# Ablations: what each ingredient buys",
@@ -195,10 +204,6 @@ def _half_in(curves: Sequence[Row], recipe: str, reward: str) -> str:
 
 def _flocks(validations: Sequence[Row]) -> list[int]:
     return sorted({row["n_flocks"] for row in validations})
-
-
-def _flocks_word(n: int) -> str:
-    return f"{n} flock{'s' if n > 1 else ''}"
 
 
 def _total(rows: Sequence[Row], name: str) -> float:

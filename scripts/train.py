@@ -22,7 +22,7 @@ from shepherd_phys.learning.preset import PRESETS, Preset, load_preset
 from shepherd_phys.settings import SettingsError, kind_of
 from shepherd_phys.world import World
 
-from .command import LOG_SECONDS, at_least, clock, cpu_count, fail, flag, parsed
+from .command import LOG_SECONDS, at_least, clock, counted, cpu_count, fail, flag, parsed
 from .own import find_kinds, find_reward, find_scenario, of_kinds, own_classes, try_out
 
 PROG = "shepherd-phys train"
@@ -250,9 +250,9 @@ def pace_of(now: Any) -> str:
 def validation_of(now: Any) -> str:
     """What a run reports of a validation, in words."""
     points = ", ".join(
-        f"{row['in_goal_end']:.1f} % in, {row['path_length']:.0f} m with {row['n_flocks']} flocks"
+        f"{row['in_goal_end']:.1f} % in, {row['path_length']:.0f} m with {counted(row['n_flocks'], 'flock')}"
         + (f" n {row['cohesion']}" if len({r["cohesion"] for r in now.validation}) > 1 else "")
-        + (f" {row['n_shepherds']} shepherds" if len({r["n_shepherds"] for r in now.validation}) > 1 else "")
+        + (f" {counted(row['n_shepherds'], 'shepherd')}" if len({r["n_shepherds"] for r in now.validation}) > 1 else "")
         for row in now.validation
     )
     return f"validation at {now.shepherd_steps:,} shepherd-steps: {points}"

@@ -12,7 +12,7 @@ import inspect
 import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self, TypeVar, cast, dataclass_transform
+from typing import Any, Self, TypeVar, cast, dataclass_transform, get_args
 
 import pydantic
 import tomli_w
@@ -57,12 +57,15 @@ def _explain(cls: type[Any], error: pydantic.ValidationError) -> str:
     """One line for every field that is wrong: where, what was given, what is allowed."""
     names = [f.name for f in dataclasses.fields(cls)]
     problems = error.errors(include_url=False)
-    unknown = {
-        str(problem["loc"][-1]): problem["input"]
-        for problem in problems
-        if problem["type"] == "unexpected_keyword_argument"
-    }
-    lines = [_no_such_field(cls, unknown)] if unknown else []
+    unknown: dict[tuple[Any, ...], dict[str, Any]] = {}  # by where: fields of settings within settings, too
+    for problem in problems:
+        if problem["type"] == "unexpected_keyword_argument":
+            *path, name = problem["loc"]
+            unknown.setdefault(tuple(path), {})[str(name)] = problem["input"]
+    lines = [
+        _no_such_field(_inside(cls, path), found, ".".join([cls.__name__, *map(str, path)]))
+        for path, found in unknown.items()
+    ]
     for problem in problems:
         if problem["type"] == "unexpected_keyword_argument":
             continue  # all of them are told at once
@@ -78,10 +81,20 @@ def _explain(cls: type[Any], error: pydantic.ValidationError) -> str:
     return "; ".join(lines)
 
 
-def _no_such_field(cls: type[Any], unknown: Mapping[str, Any]) -> str:
+def _inside(cls: type[Any], path: Iterable[Any]) -> type[Any]:
+    """The settings class of what is at ``path``; of what it is in, where there are several."""
+    for name in path:
+        field = cls.__pydantic_fields__.get(name)
+        kinds = () if field is None else (field.annotation, *get_args(field.annotation))
+        found = [kind for kind in kinds if hasattr(kind, "__pydantic_fields__")]
+        cls = found[0] if len(found) == 1 else cls
+    return cls
+
+
+def _no_such_field(cls: type[Any], unknown: Mapping[str, Any], where: str) -> str:
     """The error for unknown fields: a few of them, and once what there is; one alone with what may have been meant."""
     names = [f.name for f in dataclasses.fields(cls)]
-    shown = f"{cls.__name__}.{', '.join(list(unknown)[:MOST_TOLD])}"
+    shown = f"{where}.{', '.join(list(unknown)[:MOST_TOLD])}"
     more = f" and {len(unknown) - MOST_TOLD} more" if len(unknown) > MOST_TOLD else ""
     there = f"fields are {', '.join(names)}"
     if len(unknown) > 1:
@@ -129,7 +142,8 @@ class Settings:
         fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}  # type: ignore[arg-type]
         unknown = [name for name in changes if name not in fields]
         if unknown:
-            raise SettingsError(_no_such_field(type(self), {name: changes[name] for name in unknown}))
+            cls = type(self)
+            raise SettingsError(_no_such_field(cls, {name: changes[name] for name in unknown}, cls.__name__))
         return type(self)(**{**fields, **changes})
 
     def to_dict(self) -> dict[str, Any]:

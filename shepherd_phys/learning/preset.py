@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -56,8 +56,8 @@ Fractions = Annotated[
 
 @settings
 class Preset(Settings):
-    """A training run. The defaults are what trains fast, less its wandering; the budget and rates are in shepherd-steps (control steps
-    times shepherds).
+    """A training run. The defaults are what trains fast, less its wandering; the budget and rates are in shepherd-steps
+    (control steps times shepherds).
     """  # noqa: D205
 
     reward: str | Mapping[str, tuple[float, Any]] = "wild"
@@ -349,14 +349,10 @@ class Preset(Settings):
             values["scenario"] = SCENARIOS[name]
         if isinstance(values.get("scenario"), Mapping):
             values["scenario"] = Scenario.from_dict(values["scenario"], classes)
-        for part, made in PARTS.items():
-            if part in values and not isinstance(values[part], Scenario):
-                if not isinstance(values[part], Mapping):
-                    raise SettingsError(f"Preset.{part}: must be a table (given: {values[part]!r})")
-                own = values[part]
-                if part == "lidar":  # by now the scenario has been made
-                    own = {"channels": _channels(**values), **own}
-                values[part] = made(own)
+        if isinstance(values.get("lidar"), Mapping):  # by now the scenario has been made
+            values["lidar"] = {"channels": _channels(**values), **values["lidar"]}
+        if isinstance(values.get("network"), Mapping):
+            values["network"] = without_scatter(values["network"])
         return cls(**values)
 
     @classmethod
@@ -381,16 +377,6 @@ def _channels(scenario: Any = None, scenarios: Any = (), **_: Any) -> tuple[Chan
     return max((one.channels for one in every), key=len)
 
 
-PARTS: dict[str, Callable[[Mapping[str, Any]], Any]] = {
-    "scenario": Scenario.from_dict,
-    "lidar": lambda table: Lidar(**table),
-    "network": lambda table: SectorNetwork(**without_scatter(table)),
-    "critic": lambda table: CriticNetwork(**table),
-    "ppo": lambda table: PPOSettings(**table),
-    "hold": lambda table: Hold(**table),
-    "wander": lambda table: Wander(**table),
-    "validation": lambda table: Validation(**table),
-}
 PRESETS = {path.stem: path for path in sorted(FOLDER.glob("*.toml"))}
 """The presets that come with the package, by name."""
 
