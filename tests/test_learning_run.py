@@ -499,6 +499,20 @@ def test_a_run_whose_learning_rate_falls_keeps_its_budget(tmp_path, capsys):
     assert Preset.from_toml(tmp_path / "run" / "preset.toml").budget == PRESET.budget
 
 
+def test_a_run_does_not_go_on_by_a_preset_that_was_changed(unbroken, tmp_path, capsys):
+    shutil.copytree(unbroken, tmp_path / "run")
+    written = tmp_path / "run" / "preset.toml"
+    kept, before = load_preset(written), sorted((tmp_path / "run").rglob("*"))
+    kept.but(seed=3, ppo=kept.ppo.but(gamma=0.5)).to_toml(written)
+    assert train_main(["--resume", "--out", str(tmp_path / "run"), "--budget", "9000"]) == 2
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert f"{written}: ppo, seed changed since the run began" in said
+    assert sorted((tmp_path / "run").rglob("*")) == before
+    kept.to_toml(written)
+    train(tmp_path / "run")
+    assert load_preset(written) == kept
+
+
 @pytest.mark.slow
 def test_the_command_trains_resumes_and_evaluates(tmp_path):
     TINY.but(budget=200).to_toml(tmp_path / "tiny.toml")

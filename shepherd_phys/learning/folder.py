@@ -26,6 +26,8 @@ FIRST = "first.json"
 CHECKPOINTS = "checkpoints"
 TENSORBOARD = "tensorboard"
 LOCK = "run.lock"
+SETTINGS = "settings"
+"""Fact of a checkpoint: what `settings_of` gives."""
 
 MEASURES = ("in_goal_end", "ever_in_goal", "mean_occupancy", "path_length", "time_to_95", "success")
 """What a validation measures, see `shepherd_phys.controllers.evaluation.run_episode`."""
@@ -77,6 +79,26 @@ def agree(folder: Path, preset: Preset, classes: Iterable[Any] = ()) -> Preset:
     if kept.budget != preset.budget and kept.ppo.last_learning_rate is not None:
         raise SettingsError(f"{folder}: its learning rate falls over its budget, {kept.budget}, which stays what it is")
     return kept
+
+
+def settings_of(preset: Preset) -> dict[str, Any]:
+    """What stays the same as long as a run lasts, as plain data."""
+    return {name: value for name, value in preset.to_dict().items() if name != "budget"}
+
+
+def check_settings(saved: Checkpoint, preset: Preset, path: Path) -> None:
+    """Find out whether a preset, read from ``path``, is still that of the run which wrote a checkpoint.
+
+    Raises:
+        SettingsError: it was changed; the message names the fields.
+    """
+    then, now = saved.facts.get(SETTINGS), settings_of(preset)  # earlier versions did not tell
+    if then is not None and then != now:
+        changed = sorted(name for name in {*then, *now} if then.get(name) != now.get(name))
+        raise SettingsError(
+            f"{path}: {', '.join(changed)} changed since the run began, which can go on only as it was: undo that, and "
+            "train what you want in another folder, by a copy of the file given as --preset"
+        )
 
 
 @contextmanager

@@ -26,14 +26,17 @@ from shepherd_phys.learning.folder import (
     FIRST,
     POLICY,
     PRESET,
+    SETTINGS,
     TENSORBOARD,
     VALIDATION,
     VALIDATION_COLUMNS,
     Table,
     agree,
     alone,
+    check_settings,
     ended,
     is_policy_of,
+    settings_of,
 )
 from shepherd_phys.learning.ppo import Learner
 from shepherd_phys.learning.preset import Preset
@@ -95,8 +98,8 @@ def train(
         the best policy.
 
     Raises:
-        SettingsError: another process trains in the folder; it holds another run; or the policy to start from cannot
-            be had.
+        SettingsError: another process trains in the folder; it holds another run, or its preset was changed; or the
+            policy to start from cannot be had.
         TrainingError: something is not finite.
         CheckpointError: a checkpoint cannot be written, or none of those there can be read, or gone on from.
     """
@@ -106,6 +109,8 @@ def train(
         if preset is None or preset.budget < kept.budget:
             preset = kept
         newest = saved = checkpoints.load_latest(folder / CHECKPOINTS)
+        if newest is not None:
+            check_settings(newest, preset, folder / PRESET)
         if newest is not None and not ended(newest, n_rollouts, seconds):
             saved = _gone_on_from(newest, preset, folder / CHECKPOINTS)
         decisions = 0 if saved is None else int(saved.facts["decisions"])
@@ -273,6 +278,7 @@ class _Run:
         """Write the checkpoint and the policies."""
         arrays, facts = self._learner.state()
         facts |= {"seconds": self._seconds, "out_of_turn": self._out_of_turn}
+        facts[SETTINGS] = settings_of(self._learner.preset)
         for file, kept in self.chosen.items():
             key = Path(file).stem
             arrays |= {f"{key}/{name}": array for name, array in kept.weights.items()}
