@@ -29,16 +29,8 @@ def figure1_page(curves: Sequence[Row], validations: Sequence[Row], home: Sequen
         home: rows of ``time-to-home.csv``, of runs of `TIMED_SCHEME` that were trained alone.
     """
     flocks = _flocks(validations)
-    head = [
-        "recipe",
-        "reward",
-        "seeds",
-        "final reward",
-        "levels off at",
-        *(counted(n, "flock") for n in flocks),
-        "rate",
-        "time",
-    ]
+    head = ["recipe", "reward", "seeds", "final reward", "levels off at", *(counted(n, "flock") for n in flocks),
+            "rate", "time"]  # fmt: skip
     lines = [
         "# Figure 1: learning curves",
         "",

@@ -73,8 +73,7 @@ def agree(folder: Path, preset: Preset, classes: Iterable[Any] = ()) -> Preset:
         SettingsError: it is another run, or none that can be read.
     """
     kept = Preset.from_toml(folder / PRESET, classes)
-    # as they are written: two objects of a user's class need not be equal where they are the same
-    if kept.but(budget=preset.budget).to_dict() != preset.to_dict():
+    if settings_of(kept) != settings_of(preset):
         raise SettingsError(f"{folder}: holds a run with other settings")
     if kept.budget != preset.budget and kept.ppo.last_learning_rate is not None:
         raise SettingsError(f"{folder}: its learning rate falls over its budget, {kept.budget}, which stays what it is")
@@ -83,6 +82,7 @@ def agree(folder: Path, preset: Preset, classes: Iterable[Any] = ()) -> Preset:
 
 def settings_of(preset: Preset) -> dict[str, Any]:
     """What stays the same as long as a run lasts, as plain data."""
+    # as it is written: two objects of a user's class need not be equal where they are the same
     return {name: value for name, value in preset.to_dict().items() if name != "budget"}
 
 

@@ -111,8 +111,8 @@ def train(
         newest = saved = checkpoints.load_latest(folder / CHECKPOINTS)
         if newest is not None:
             check_settings(newest, preset, folder / PRESET)
-        if newest is not None and not ended(newest, n_rollouts, seconds):
-            saved = _gone_on_from(newest, preset, folder / CHECKPOINTS)
+            if not ended(newest, n_rollouts, seconds):
+                saved = _gone_on_from(newest, preset, folder / CHECKPOINTS)
         decisions = 0 if saved is None else int(saved.facts["decisions"])
         logger = Logger(str(folder / TENSORBOARD), [_TensorBoard(folder / TENSORBOARD, decisions)])
         learner = Learner(preset, n_workers if n_workers > 1 else 0, logger, fresh=saved is None)
