@@ -46,6 +46,7 @@ reproduce: build/.installed  ## run the paper's experiments (hours; continues) a
 	mkdir -p docs/reproduction
 	for name in figure2 figure3 $(STUDIES); do for kind in csv md png; do \
 		cp results/reproduce/$$name.$$kind docs/reproduction/ || exit 1; done; done
+	cp results/reproduce/figure[23]-differences.csv docs/reproduction/
 	cp results/reproduce/claims.json results/reproduce/claims.md docs/reproduction/
 
 .venv: build/.installed  ## the whole development environment

@@ -15,12 +15,13 @@ CLAIMED_TRIALS = 100
 """The paper's trials a point."""
 
 
-def figure_page(name: str, summary: Sequence[Mapping[str, Any]]) -> str:
+def figure_page(name: str, summary: Sequence[Mapping[str, Any]], differences: Sequence[Mapping[str, Any]] = ()) -> str:
     """The figure with its tables.
 
     Args:
         name: of `EXPERIMENTS`.
         summary: rows of its CSV.
+        differences: rows of the CSV of differences, all from the same baseline; none: not told.
     """
     experiment = EXPERIMENTS[name]
     fixed = "cohesion" if experiment.varied == "n_flocks" else "n_flocks"
@@ -29,9 +30,6 @@ def figure_page(name: str, summary: Sequence[Mapping[str, Any]]) -> str:
         words[label].format(_range(row[label] for row in summary))
         for label in (fixed, "n_shepherds", "n_sheep", "trials")
     ]
-    columns = sorted({row[experiment.varied] for row in summary})
-    methods = list(dict.fromkeys(row["controller"] for row in summary))
-    cells = {(row["controller"], row[experiment.varied]): row for row in summary}
     lines = [
         f"# {experiment.title}",
         "",
@@ -41,13 +39,26 @@ def figure_page(name: str, summary: Sequence[Mapping[str, Any]]) -> str:
         "claims.json has seed and version.",
     ]
     for metric, (title, digits) in {**MEASURES, "time_to_95": LATE}.items():
-        head = ["controller", *(SHOWN[experiment.varied].format(column) for column in columns)]
-        lines += ["", f"**{title}**", "", line(head), line(["---", *["---:"] * len(columns)])]
-        for method in methods:
-            rows = [cells.get((method, column)) for column in columns]
-            shown = ["" if row is None else _interval(row, f"{metric}_mean", f"{metric}_", digits) for row in rows]
-            lines.append(line([f"`{method}`", *shown]))
+        lines += ["", f"**{title}**", "", *_methods_by_point(summary, experiment.varied, metric, digits)]
+    for metric, (title, _) in {**MEASURES, "time_to_95": LATE}.items() if differences else ():
+        lines += ["", f"**{title}: each minus `{differences[0]['baseline']}`, paired by trial**", ""]
+        lines += _methods_by_point(differences, experiment.varied, f"{metric}_diff", ".1f")
     return "\n".join([*lines, ""])
+
+
+def _methods_by_point(rows: Sequence[Mapping[str, Any]], varied: str, metric: str, digits: str) -> list[str]:
+    """A table of one measure: a line a method, a column a point."""
+    columns = sorted({row[varied] for row in rows})
+    cells = {(row["controller"], row[varied]): _interval(row, f"{metric}_mean", f"{metric}_", digits) for row in rows}
+    head = ["controller", *(SHOWN[varied].format(column) for column in columns)]
+    return [
+        line(head),
+        line(["---", *["---:"] * len(columns)]),
+        *(
+            line([f"`{method}`", *(cells.get((method, column), "") for column in columns)])
+            for method in dict.fromkeys(row["controller"] for row in rows)
+        ),
+    ]
 
 
 def study_page(name: str, title: str, intro: str, baseline: str | None, summary: Sequence[Mapping[str, Any]]) -> str:

@@ -7,7 +7,7 @@ import importlib
 import json
 import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TextIO
@@ -22,7 +22,7 @@ from shepherd_phys.campaign import Ledger, Outcome, Task, remove, write_bytes, w
 from shepherd_phys.controllers import CONTROLLERS
 from shepherd_phys.controllers.claims import EXPERIMENTS, HEURISTICS, LEARNED, LITERAL, judge
 from shepherd_phys.controllers.evaluation import COLUMNS, trial_seed
-from shepherd_phys.controllers.summary import summarise, summary_columns
+from shepherd_phys.controllers.summary import difference_columns, paired_differences, summarise, summary_columns
 from shepherd_phys.settings import SettingsError
 
 from . import studies
@@ -37,6 +37,8 @@ PROG = "shepherd-phys reproduce"
 SCENARIO = "paper"
 EPISODES = (*EXPERIMENTS, "all")
 """Figures made of episodes; all of these."""
+BASELINE = "collie"
+"""Whom these compare the others with, trial by trial, where it is among them: the best that we have."""
 CHOICES = ("figure1", *EPISODES, *STUDIES, "ablations")
 GOES_WITH = {
     **dict.fromkeys(("literal", "scheduler", "gather"), EPISODES),
@@ -71,7 +73,7 @@ class Reproduce:
     """Root seed: trial i has a seed derived from S and i alone, the same for every controller and point."""
     seeds: Annotated[int | None, flag("K", "5 in figure1, 3 in ablations")] = None
     """Training runs of each scheme or variant, with seeds from 1,000,000."""
-    budget: Annotated[int | None, flag("N", "6,400,000 in figure1, 2,500,000 in ablations")] = None
+    budget: Annotated[int | None, flag("N", "8,250,000 in figure1, 2,500,000 in ablations")] = None
     """Shepherd-steps of each training run, which ends with a whole checkpoint interval."""
     paper_hours: Annotated[float, flag("HOURS")] = 2.0
     """In figure1: hours of training for one run by the preset paper, drawn beside; 0: none."""
@@ -131,20 +133,22 @@ def figures(options: Reproduce, out: TextIO) -> int:
     methods = roster(options.controllers, options.literal)
     seeds = [trial_seed(options.seed, trial) for trial in range(options.trials)]
     check_drawing()
-    curves = studies.kept_curves(options.out)
+    studies.kept_curves(options.out)  # before hours of computing: can they be read
     todo, everything = work(asked, methods, seeds), work(list(EXPERIMENTS), methods, seeds)
     workers = workforce(PROG, options.workers, options.scheduler)
     with opened(options.out, todo, workers=workers, timeout=options.timeout, gather=options.gather) as ours:
         outcome = ours.run(todo)
         rows = table(everything, kept(ours.ledger, everything))
         summaries = {name: summary_of(name, rows, methods) for name in asked}
+        differences = {name: differences_of(name, rows, methods) for name in asked}
         claims = {
             "trials": options.trials,
             "seed": options.seed,
             "version": __version__,
-            "claims": [claim.to_dict() for claim in judge(rows, seeds, curves=curves)],
+            # the curves as they are now: figure 1 may have been made meanwhile
+            "claims": [claim.to_dict() for claim in judge(rows, seeds, curves=studies.kept_curves(options.out))],
         }
-        paths = write_files(options.out, rows, summaries, claims)
+        paths = write_files(options.out, rows, summaries, differences, claims)
     if options.json:
         print(json.dumps({**summaries, "claims": claims}, allow_nan=False, indent=1), file=out)
     else:
@@ -199,7 +203,19 @@ def summary_of(name: str, rows: Sequence[Mapping[str, Any]], methods: Sequence[s
         {**row, "settings_hash": hashes[row["controller"], row["n_flocks"], row["cohesion"]]}
         for row in summarise(row for row in rows if (row["n_flocks"], row["cohesion"]) in there)
     ]
-    return sorted(summary, key=lambda row: (methods.index(row["controller"]), row["n_flocks"], row["cohesion"]))
+    return _by_method(summary, methods)
+
+
+def differences_of(name: str, rows: Sequence[Mapping[str, Any]], methods: Sequence[str]) -> list[dict[str, Any]]:
+    """The rows of an experiment's CSV of differences from `BASELINE`, method by method; none without it."""
+    mine = [row for row in rows if (row["n_flocks"], row["cohesion"]) in EXPERIMENTS[name].points]
+    if not any(row["controller"] == BASELINE for row in mine):
+        return []
+    return _by_method(paired_differences(mine, BASELINE), methods)
+
+
+def _by_method(rows: Iterable[dict[str, Any]], methods: Sequence[str]) -> list[dict[str, Any]]:
+    return sorted(rows, key=lambda row: (methods.index(row["controller"]), row["n_flocks"], row["cohesion"]))
 
 
 def check_drawing() -> None:
@@ -218,6 +234,7 @@ def write_files(
     folder: Path,
     rows: Sequence[Mapping[str, Any]],
     summaries: Mapping[str, Sequence[Mapping[str, Any]]],
+    differences: Mapping[str, Sequence[Mapping[str, Any]]],
     claims: Mapping[str, Any],
 ) -> list[Path]:
     """Write every table, page and figure; their paths.
@@ -232,13 +249,19 @@ def write_files(
     paths = [episodes]
     for name, summary in summaries.items():
         own = [folder / f"{name}.{kind}" for kind in ("csv", "md", "png")]
+        apart = folder / f"{name}-differences.csv"
+        if not differences[name]:
+            remove([apart])
         if not summary:  # every episode failed, which is reported; what an earlier run drew must not stand for it
             remove(own)
             continue
         write_csv(own[0], (*summary_columns(), "settings_hash"), summary)
-        write_bytes(own[1], figure_page(name, summary).encode())
+        write_bytes(own[1], figure_page(name, summary, differences[name]).encode())
         write_bytes(own[2], draw(EXPERIMENTS[name], summary))
         paths += own
+        if differences[name]:
+            write_csv(apart, difference_columns(), differences[name])
+            paths.append(apart)
     text = json.dumps(claims, allow_nan=False, indent=1, ensure_ascii=False)
     write_bytes(folder / "claims.json", f"{text}\n".encode())
     write_bytes(folder / "claims.md", claims_page(claims).encode())

@@ -23,7 +23,7 @@ LEARNING = {
     "ablations": ["ablations.csv", "ablations-validation.csv", "ablations.md", "ablations.png"],
 }
 FILES = [
-    *(f"{name}.{kind}" for name in EXPERIMENTS for kind in ("csv", "md", "png")),
+    *(f"{name}{kind}" for name in EXPERIMENTS for kind in (".csv", "-differences.csv", ".md", ".png")),
     *(name for names in LEARNING.values() for name in names),
     *("claims.json", "claims.md"),
     *(f"{name}.{kind}" for name in STUDIES for kind in ("csv", "md", "png")),
@@ -72,6 +72,27 @@ def test_a_figures_page():
     ]
 
 
+def test_a_figures_page_tells_the_differences_from_the_best():
+    numbers = {f"{metric}_diff_{part}": value for metric in ("in_goal_end", "path_length", "time_to_95")
+               for part, value in zip(("mean", "low", "high"), (1.26, -2.0, 3.04), strict=True)}  # fmt: skip
+    apart = [{"controller": "wild", "n_flocks": 2, "cohesion": n, "baseline": "collie", **numbers} for n in (10, 25)]
+    without = figure_page("figure3", [row("wild", 2, 10)]).splitlines()
+    told = figure_page("figure3", [row("wild", 2, 10)], apart).splitlines()
+    assert told[: len(without)] == without
+    assert told[len(without) :][:6] == [
+        "",
+        "**Sheep in the goal at the end, %: each minus `collie`, paired by trial**",
+        "",
+        "| controller | n = 10 | n = 25 |",
+        "| --- | ---: | ---: |",
+        "| `wild` | 1.3 [-2.0, 3.0] | 1.3 [-2.0, 3.0] |",
+    ]
+    assert [line for line in told if "each minus" in line][1:] == [
+        "**Path of a shepherd, m: each minus `collie`, paired by trial**",
+        "**Time until 95 % are in, s (the whole episode where they never were): each minus `collie`, paired by trial**",
+    ]
+
+
 def test_a_page_says_where_trials_differ():
     rows = [row("wild", 1), {**row("wild", 2), "trials": 99}]
     assert ", 99 to 100 trials a point; " in figure_page("figure2", rows)
@@ -113,7 +134,9 @@ def read(path):
 def test_the_guides_table_says_what_its_csv_holds(name):
     if not (REPRODUCTION / f"{name}.csv").exists():
         pytest.skip("no results are committed")
-    assert (REPRODUCTION / f"{name}.md").read_text("utf-8") == figure_page(name, read(REPRODUCTION / f"{name}.csv"))
+    paths = [REPRODUCTION / f"{name}{kind}.csv" for kind in ("", "-differences")]
+    tables = [read(path) for path in paths if path.exists()]
+    assert (REPRODUCTION / f"{name}.md").read_text("utf-8") == figure_page(name, *tables)
     assert (REPRODUCTION / f"{name}.png").read_bytes().startswith(b"\x89PNG")
 
 

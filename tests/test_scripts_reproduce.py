@@ -153,6 +153,26 @@ def test_both_figures_share_what_they_share(folder, capsys):
     assert figure_page("figure3", said["figure3"]) == Path("o/figure3.md").read_text("utf-8")
 
 
+def test_who_has_the_best_beside_them_is_compared_with_it_trial_by_trial(folder, monkeypatch):
+    monkeypatch.setattr(reproduce, "BASELINE", "idle")
+    assert run("all", "--controllers", "strombom", "idle", "elfiqi") == 0
+    rows = [row for row in read("o/episodes.csv") if (row["n_flocks"], row["cohesion"]) == ("2", "40")]
+    path = {(row["controller"], row["seed"]): float(row["path_length"]) for row in rows}
+    longer = [path[name, seed] - path["idle", seed] for name, seed in path if name == "elfiqi"]
+    for name in ("figure2", "figure3"):
+        table = read(f"o/{name}-differences.csv")
+        assert [row["controller"] for row in table] == ["strombom"] * (len(table) // 2) + ["elfiqi"] * (len(table) // 2)
+        (told,) = [r for r in table if (r["controller"], r["n_flocks"], r["cohesion"]) == ("elfiqi", "2", "40")]
+        assert (told["baseline"], told["trials"]) == ("idle", "2")
+        assert float(told["path_length_diff_mean"]) == pytest.approx(sum(longer) / 2) and sum(longer) > 0
+        assert "**Path of a shepherd, m: each minus `idle`, paired by trial**" in Path(f"o/{name}.md").read_text(
+            "utf-8"
+        )
+    assert run("figure2", "--controllers", "strombom") == 0
+    assert not Path("o/figure2-differences.csv").exists()  # an earlier run's comparison must not stand for this one
+    assert "each minus" not in Path("o/figure2.md").read_text("utf-8")
+
+
 def test_a_finished_run_runs_nothing_and_writes_the_same(folder, monkeypatch):
     assert run("all", "--controllers", "idle") == 0
     first = contents()
