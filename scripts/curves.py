@@ -19,6 +19,7 @@ from shepherd_phys.learning.folder import (
     CURVE,
     FIRST,
     PRESET,
+    UNJUDGED,
     VALIDATION,
     agree,
     begin,
@@ -81,7 +82,8 @@ def _whole(run: Run, place: Path) -> bool:
         raise SettingsError(str(error)) from None
     if saved is None:
         return _told(run, place)
-    return ended(saved, run.preset.n_rollouts, 3600.0 * run.hours) and exported(place, saved)
+    judged = not saved.facts.get(UNJUDGED, False)
+    return ended(saved, run.preset.n_rollouts, 3600.0 * run.hours) and judged and exported(place, saved)
 
 
 def _told(run: Run, place: Path) -> bool:
@@ -92,7 +94,7 @@ def _told(run: Run, place: Path) -> bool:
     if not ((place / CURVE).exists() and (place / VALIDATION).exists()):
         return False
     rows = read_rows(place / CURVE, ("rollout", "seconds"))
-    judged = read_rows(place / VALIDATION, ("checkpoint", "in_goal_end"))
+    judged = read_rows(place / VALIDATION, ("checkpoint", "shepherd_steps", "in_goal_end"))
     done, interval = len(rows), run.preset.checkpoint_rollouts
     if not done or rows[-1]["rollout"] != done or done % interval:
         return False
@@ -100,7 +102,9 @@ def _told(run: Run, place: Path) -> bool:
         return False
     if sum(row["checkpoint"] == done // interval for row in judged) != run.preset.validation.n_points:
         return False
-    return not run.timed or home_at(judged) is None or is_policy_of(place / FIRST)
+    first = home_at(judged) if run.timed else None
+    steps = {row["shepherd_steps"] for row in judged if row["checkpoint"] == first}
+    return first is None or is_policy_of(place / FIRST, shepherd_steps=steps.pop())
 
 
 def home_at(rows: Iterable[Row]) -> int | None:

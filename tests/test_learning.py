@@ -309,6 +309,40 @@ def test_a_nan_of_the_worlds_is_named(where, learner, monkeypatch):
         learner.learn()
 
 
+def test_a_nan_at_the_beginning_is_named(learner, monkeypatch):
+    restart = learner.env.restart
+
+    def broken(number):
+        observation = restart(number)
+        observation["lidar"][1] = np.nan
+        return observation
+
+    monkeypatch.setattr(learner.env, "restart", broken)
+    with pytest.raises(TrainingError, match="observation 'lidar': holds a NaN"):
+        learner.restart(1)
+
+
+@pytest.mark.parametrize(
+    ("notes", "raised", "said"),
+    [
+        ((), TrainingError, "^learning failed: the wolf came$"),
+        (("in world 0",), ValueError, "^the wolf came\nin world 0$"),
+    ],
+)
+def test_a_users_value_error_is_not_taken_for_learnings(notes, raised, said, learner, monkeypatch):
+    """Those of a world say in which; without that it is torch's, which a NaN has upset."""
+
+    def broken():
+        error = ValueError("the wolf came")
+        for note in notes:
+            error.add_note(note)
+        raise error
+
+    monkeypatch.setattr(learner.env, "step_wait", broken)
+    with pytest.raises(raised, match=said):
+        learner.learn()
+
+
 def test_a_nan_of_the_network_is_named(learner):
     with torch.no_grad():
         learner.policy.pi_features_extractor.hidden.weight[0, 0] = np.inf

@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,12 +17,14 @@ import safetensors.numpy
 from test_learning import TINY
 
 from shepherd_phys.controllers import load_policy
+from shepherd_phys.controllers.policy_files import write_policy
+from shepherd_phys.envs.rewards import Effort
 from shepherd_phys.learning import checkpoints, run
 from shepherd_phys.learning.checkpoints import Checkpoint, CheckpointError
 from shepherd_phys.learning.folder import CURVE_COLUMNS, Table, alone, begin, exported
 from shepherd_phys.learning.preset import Preset, load_preset
 from shepherd_phys.learning.run import train
-from shepherd_phys.learning.validation import Validator
+from shepherd_phys.learning.validation import ValidationError, Validator
 from shepherd_phys.scripts.train import main as train_main
 from shepherd_phys.settings import SettingsError
 
@@ -32,6 +35,16 @@ PRESET = TINY.but(budget=600)
 
 KILLS = 50
 """Of the test that kills by force."""
+
+
+@dataclass(frozen=True)
+class Near:
+    """A reward term of a user's own."""
+
+    reach: float = float("inf")
+
+    def __call__(self, before, after, scan, scenario):
+        return 0.0
 
 
 class Killed(Exception):
@@ -388,6 +401,110 @@ def test_policies_of_an_earlier_checkpoint_are_not_the_last_ones(unbroken):
     assert not exported(unbroken, Checkpoint(4, saved.arrays, {**saved.facts, "first": {"shepherd_steps": 1}}))
 
 
+@pytest.mark.parametrize("left", ["all", "tables"])
+def test_a_run_whose_checkpoints_are_gone_keeps_what_it_has_written(left, unbroken, tmp_path, capsys):
+    shutil.copytree(unbroken, tmp_path / "run", ignore=shutil.ignore_patterns("checkpoints"))
+    if left == "tables":
+        for name in ("policy.json", "policy.safetensors", "best.json", "best.safetensors"):
+            (tmp_path / "run" / name).unlink()
+    before = {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir() if path.is_file()}
+    assert train_main(["--resume", "--out", str(tmp_path / "run")]) == 2
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert f"{tmp_path / 'run'}: holds 6 rollouts in curve.csv and no checkpoint to go on from" in said
+    assert {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir() if path.is_file()} == before
+
+
+def test_a_run_goes_on_after_an_upgrade_that_knows_more_settings(unbroken, tmp_path):
+    shutil.copytree(unbroken, tmp_path / "run")
+    saved = checkpoints.load_latest(unbroken / "checkpoints")
+    settings = {name: value for name, value in saved.facts["settings"].items() if name != "learns_mirrored"}
+    assert settings != saved.facts["settings"]
+    checkpoints.save(
+        tmp_path / "run" / "checkpoints",
+        Checkpoint(saved.number, saved.arrays, {**saved.facts, "settings": {**settings, "seed": 3}}),
+    )
+    with pytest.raises(SettingsError, match=f": seed, now {PRESET.seed}, was 3. Undo that"):
+        train(tmp_path / "run")
+    checkpoints.save(
+        tmp_path / "run" / "checkpoints",
+        Checkpoint(saved.number, saved.arrays, {**saved.facts, "settings": settings}),
+    )
+    train(tmp_path / "run")
+
+
+def test_a_validation_that_fails_costs_nothing_learned(unbroken, tmp_path, monkeypatch):
+    begin(tmp_path, PRESET)
+    judge, tried = Validator.__call__, []
+
+    def failing(self, policy):
+        tried.append(policy)
+        if len(tried) in (2, 3):
+            raise ValidationError("validation, seed 7: died")
+        return judge(self, policy)
+
+    monkeypatch.setattr(Validator, "__call__", failing)
+    for _ in range(2):  # the second time it fails before anything is learned
+        with pytest.raises(ValidationError, match="seed 7: died"):
+            train(tmp_path)
+        assert len(rows_of(tmp_path / "curve.csv")) == 4 and len(rows_of(tmp_path / "validation.csv")) == 1
+        saved = checkpoints.load_latest(tmp_path / "checkpoints")
+        assert (saved.number, saved.facts["unjudged"]) == (2, True)
+    train(tmp_path)
+    assert len(tried) == 5
+    assert_same_run(tmp_path, unbroken)
+
+
+def test_a_validation_of_this_process_says_in_one_line_where_it_failed(tmp_path, monkeypatch):
+    def broken(play, seed):
+        raise ZeroDivisionError("of a user's own")
+
+    monkeypatch.setattr("shepherd_phys.learning.validation.episode", broken)
+    begin(tmp_path, PRESET)
+    with pytest.raises(ValidationError, match=r"validation, seed \d+: ZeroDivisionError: of a user's own \(test_lea"):
+        train(tmp_path)
+
+
+def test_a_run_begins_with_the_policy_that_was_there_when_it_was_made(tmp_path):
+    for k in (0, 1):
+        begin(tmp_path / str(k), TINY.but(seed=5 + k, budget=1))
+        train(tmp_path / str(k))
+    fine = PRESET.but(budget=240, init=str(tmp_path / "init.json"), critic_first=9)
+    for kind in ("json", "safetensors"):
+        shutil.copy(tmp_path / "0" / f"policy.{kind}", tmp_path / f"init.{kind}")
+    begin(tmp_path / "run", fine)
+    for kind in ("json", "safetensors"):
+        shutil.copy(tmp_path / "1" / f"policy.{kind}", tmp_path / f"init.{kind}")
+    train(tmp_path / "run")
+    learned = load_policy(tmp_path / "run" / "policy.json").weights
+    first, other = (load_policy(tmp_path / str(k) / "policy.json").weights for k in (0, 1))
+    same = [name for name in learned if name != "log_std"]  # only the critic has learned
+    assert all(np.array_equal(learned[name], first[name]) for name in same)
+    assert not all(np.array_equal(first[name], other[name]) for name in same)
+    shutil.rmtree(tmp_path / "run" / "checkpoints")
+    for name in ("curve.csv", "policy.json"):
+        (tmp_path / "run" / name).unlink()
+    (tmp_path / "run" / "start.safetensors").write_bytes(b"damaged")
+    with pytest.raises(SettingsError, match="start.safetensors: cannot be read"):
+        train(tmp_path / "run")
+
+
+def test_what_a_checkpoint_could_not_tell_makes_no_run(tmp_path):
+    reward = {"calm": (1.0, Effort()), "near": (1.0, Near())}
+    with pytest.raises(SettingsError, match=r"reward\.near\.term\.reach: inf cannot be kept with a run; it must be fi"):
+        begin(tmp_path / "run", PRESET.but(reward=reward))
+    assert not (tmp_path / "run").exists()
+
+
+def test_policies_of_another_run_are_not_taken_for_its_own(unbroken, tmp_path):
+    """They count the same shepherd-steps, whatever was learned."""
+    shutil.copytree(unbroken, tmp_path / "run")
+    for name in ("policy.json", "best.json"):
+        own = load_policy(unbroken / name)
+        write_policy(tmp_path / "run" / name, own.spec, {k: v + 1 for k, v in own.weights.items()})
+    train(tmp_path / "run")
+    assert_same_run(tmp_path / "run", unbroken)
+
+
 def test_a_folder_holds_one_run(unbroken):
     with pytest.raises(SettingsError, match="holds a run: --resume continues it"):
         begin(unbroken, PRESET)
@@ -471,6 +588,12 @@ def test_a_checkpoint_that_cannot_be_written_costs_no_other(tmp_path, monkeypatc
     assert checkpoints.load_latest(tmp_path).number == 1
 
 
+def test_a_checkpoint_of_what_json_does_not_know_is_refused(tmp_path):
+    with pytest.raises(CheckpointError, match="cannot be written .*not JSON compliant"):
+        checkpoints.save(tmp_path, Checkpoint(1, ARRAYS, {"x": float("inf")}))
+    assert not list(tmp_path.glob("*"))
+
+
 def test_a_table_goes_on_where_the_checkpoint_was(tmp_path):
     table = Table(tmp_path / "curve.csv", CURVE_COLUMNS, 0)
     for rollout in (1, 2, 3):
@@ -506,7 +629,8 @@ def test_a_run_does_not_go_on_by_a_preset_that_was_changed(unbroken, tmp_path, c
     kept.but(seed=3, ppo=kept.ppo.but(gamma=0.5)).to_toml(written)
     assert train_main(["--resume", "--out", str(tmp_path / "run"), "--budget", "9000"]) == 2
     said = capsys.readouterr().err.splitlines()[-1]
-    assert f"{written}: ppo, seed changed since the run began" in said
+    assert f"{written}: changed since the run began" in said
+    assert f": ppo.gamma, now 0.5, was {kept.ppo.gamma}; seed, now 3, was {kept.seed}. Undo that" in said
     assert sorted((tmp_path / "run").rglob("*")) == before
     kept.to_toml(written)
     train(tmp_path / "run")
@@ -530,7 +654,7 @@ def test_the_command_trains_resumes_and_evaluates(tmp_path):
     assert run.returncode == 0, run.stderr
     assert len(rows_of(tmp_path / folder / "curve.csv")) == TINY.but(budget=500).n_rollouts == 6
     run = shepherd_phys("train", "--resume", "--out", str(folder), "--reward", "any", cwd=tmp_path)
-    assert run.returncode == 2 and "other settings" in run.stderr
+    assert run.returncode == 2 and "other settings: reward is 'original' there, 'any' here; --resume" in run.stderr
     command = ("evaluate", "--controllers", str(folder / "best.json"), "--scenario", "small")
     run = shepherd_phys(*command, "--trials", "1", "--workers", "1", cwd=tmp_path)
     assert run.returncode == 0, run.stderr

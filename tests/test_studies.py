@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,9 +16,11 @@ from test_learning import TINY
 
 from shepherd_phys.controllers import load_policy
 from shepherd_phys.controllers.curves import COLUMNS
+from shepherd_phys.controllers.policy_files import write_policy
 from shepherd_phys.learning import studies
 from shepherd_phys.learning.studies import Run
 from shepherd_phys.scripts import main, reproduce, train
+from shepherd_phys.scripts import studies as studies_of
 from shepherd_phys.scripts.curves import VALIDATIONS, gather, one_by_one, read_rows
 from shepherd_phys.scripts.learning_pages import ablations_page, figure1_page
 from shepherd_phys.scripts.studies import HOME_COLUMNS, Reported
@@ -221,6 +224,33 @@ def test_a_finished_run_can_be_kept_without_its_checkpoints(folder, capsys, monk
     assert again == ["wild-0", "any-0", "paper-wild-7"]
 
 
+def test_claims_that_were_judged_while_it_trained_are_kept(folder, capsys, monkeypatch):
+    assert figure1("--paper-hours", "0") == 0
+    claims = json.loads(Path("o/claims.json").read_text("utf-8"))
+    real = studies_of.gather
+
+    def meanwhile(*args):
+        claims["claims"][0]["verdict"] = "holds"  # figure 2 has ended in the same folder
+        Path("o/claims.json").write_text(json.dumps(claims))
+        return real(*args)
+
+    monkeypatch.setattr(studies_of, "gather", meanwhile)
+    assert figure1("--paper-hours", "0") == 0
+    assert json.loads(Path("o/claims.json").read_text("utf-8"))["claims"][0]["verdict"] == "holds"
+
+
+def test_a_kept_first_policy_is_that_of_the_validation_that_passed(folder, capsys, monkeypatch):
+    assert figure1("--paper-hours", "1e-9") == 0
+    shutil.rmtree("o/training/wild-0/checkpoints")
+    again = []
+    monkeypatch.setattr("shepherd_phys.scripts.curves._train", lambda run, *_: again.append(run.name) or "not now")
+    assert figure1("--paper-hours", "1e-9") == 0 and again == []
+    first = load_policy("o/training/wild-0/first.json")
+    training = {**first.spec.training, "shepherd_steps": first.spec.training["shepherd_steps"] + 1}
+    write_policy("o/training/wild-0/first.json", replace(first.spec, training=training), first.weights)
+    assert figure1("--paper-hours", "1e-9") == 1 and again == ["wild-0"]
+
+
 def test_a_folder_with_other_settings_is_left_alone(folder, capsys):
     (run,) = runs(1, 240)[:1]
     Path("o/training/wild-0").mkdir(parents=True)
@@ -228,7 +258,10 @@ def test_a_folder_with_other_settings_is_left_alone(folder, capsys):
     before = Path("o/training/wild-0/preset.toml").read_bytes()
     assert figure1(budget=240) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert "o/training/wild-0: holds a run with other settings; another --out begins anew" in line
+    assert (
+        "o/training/wild-0: holds a run with other settings: team_sizes is [3] there, [1, 2] here; worlds is 1 there, "
+        "2 here; another --out begins anew"
+    ) in line
     assert Path("o/training/wild-0/preset.toml").read_bytes() == before
 
 

@@ -47,8 +47,8 @@ def save(folder: Path, checkpoint: Checkpoint) -> Path:
     path = folder / f"checkpoint-{checkpoint.number:06d}.safetensors"
     arrays = {name: np.ascontiguousarray(array) for name, array in checkpoint.arrays.items()}
     table = {"number": checkpoint.number, "facts": dict(checkpoint.facts)}
-    table["checksum"] = _checksum(arrays, table)
     try:
+        table["checksum"] = _checksum(arrays, table)
         blob = safetensors.numpy.save(arrays, metadata={"checkpoint": json.dumps(table, allow_nan=False)})
         folder.mkdir(parents=True, exist_ok=True)
         with whole_file(path) as part:
@@ -57,6 +57,8 @@ def save(folder: Path, checkpoint: Checkpoint) -> Path:
             old.unlink()
     except OSError as error:
         raise CheckpointError(f"{path}: cannot be written ({error.strerror})") from None
+    except (TypeError, ValueError) as error:  # facts that JSON does not know
+        raise CheckpointError(f"{path}: cannot be written ({error})") from None
     return path
 
 

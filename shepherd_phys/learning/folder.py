@@ -6,11 +6,15 @@ import csv
 import math
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import safetensors.numpy
+
 from shepherd_phys.controllers.learned import load_policy
+from shepherd_phys.controllers.network import Weights
 from shepherd_phys.controllers.policy_files import PolicyError
 from shepherd_phys.files import whole_file
 from shepherd_phys.learning.checkpoints import Checkpoint
@@ -26,11 +30,17 @@ FIRST = "first.json"
 CHECKPOINTS = "checkpoints"
 TENSORBOARD = "tensorboard"
 LOCK = "run.lock"
+START = "start.safetensors"
+"""Weights of the policy that the run began with, where its preset names one: that may be another by now."""
 SETTINGS = "settings"
 """Fact of a checkpoint: what `settings_of` gives."""
+UNJUDGED = "unjudged"
+"""Fact of a checkpoint whose validation was its turn and failed, where it did: it is made up for."""
 
 MEASURES = ("in_goal_end", "ever_in_goal", "mean_occupancy", "path_length", "time_to_95", "success")
 """What a validation measures, see `shepherd_phys.controllers.evaluation.run_episode`."""
+MOST_TOLD = 80
+"""Letters of a value in a message."""
 CURVE_COLUMNS = (
     "rollout", "shepherd_steps", "decisions", "seconds", "episodes", "episode_reward", "in_goal_end", "path_length",
     "value_loss", "policy_gradient_loss", "approx_kl", "clip_fraction", "explained_variance", "std",
@@ -46,17 +56,65 @@ def begin(folder: Path, preset: Preset) -> None:
     """Make the folder of a new run, with its preset.
 
     Raises:
-        SettingsError: it holds a run already, or cannot be made; or the preset cannot be written.
+        SettingsError: it holds a run already, or cannot be made; the preset cannot be written, or holds a number that
+            no checkpoint can tell; or the policy to start from cannot be had.
     """
     _refuse_a_run(folder)
-    preset.to_dict()  # refuses what cannot be written before there is a folder
+    for name, number in _numbers(settings_of(preset)):  # before there is a folder
+        if not math.isfinite(number):
+            raise SettingsError(f"{name}: {number} cannot be kept with a run; it must be finite")
+    start = preset.start()
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise SettingsError(f"{folder}: cannot be made ({error.strerror})") from None
     with alone(folder):
         _refuse_a_run(folder)  # somebody else may have begun one just now
-        preset.to_toml(folder / PRESET)
+        if start is not None:
+            with whole_file(folder / START) as part:
+                part.write_bytes(safetensors.numpy.save(dict(start)))
+        preset.to_toml(folder / PRESET)  # comes last: where it stands there is a run
+
+
+def _numbers(value: Any, name: str = "") -> Iterator[tuple[str, float]]:
+    """The fractional numbers in plain data, with their dotted names."""
+    if isinstance(value, float):
+        yield name, value
+    for key, own in value.items() if isinstance(value, Mapping) else ():
+        yield from _numbers(own, f"{name}.{key}" if name else str(key))
+    for own in value if isinstance(value, list | tuple) else ():
+        yield from _numbers(own, name)
+
+
+def start_of(folder: Path, preset: Preset) -> Weights | None:
+    """Weights that the run in a folder began with; None where its preset names no policy to start from.
+
+    Raises:
+        SettingsError: they cannot be read; or, of a run that did not keep them, the policy cannot be had.
+    """
+    if preset.init is None or not (folder / START).exists():  # runs of earlier versions did not keep them
+        return preset.start()
+    try:
+        return safetensors.numpy.load((folder / START).read_bytes())
+    except (OSError, safetensors.SafetensorError) as error:
+        raise SettingsError(f"{folder / START}: cannot be read ({' '.join(str(error).split())})") from None
+
+
+def check_resumable(folder: Path, preset: Preset) -> None:
+    """Find out whether a run without checkpoints may begin at its first rollout, which forgets what it has written.
+
+    Raises:
+        SettingsError: it got further than its first interval, so its checkpoints must have been removed.
+    """
+    rollouts = 0
+    if (folder / CURVE).exists():
+        with open(folder / CURVE, newline="", encoding="utf-8") as file:
+            rollouts = sum(1 for _ in csv.reader(file)) - 1
+    if rollouts > preset.checkpoint_rollouts or (folder / POLICY).exists():
+        raise SettingsError(
+            f"{folder}: holds {rollouts} rollouts in {CURVE} and no checkpoint to go on from; move the folder away to "
+            "train this run anew"
+        )
 
 
 def _refuse_a_run(folder: Path) -> None:
@@ -73,8 +131,10 @@ def agree(folder: Path, preset: Preset, classes: Iterable[Any] = ()) -> Preset:
         SettingsError: it is another run, or none that can be read.
     """
     kept = Preset.from_toml(folder / PRESET, classes)
-    if settings_of(kept) != settings_of(preset):
-        raise SettingsError(f"{folder}: holds a run with other settings")
+    apart = list(_differences(settings_of(kept), settings_of(preset)))
+    if apart:
+        told = "; ".join(f"{name} is {_told(theirs)} there, {_told(ours)} here" for name, theirs, ours in apart)
+        raise SettingsError(f"{folder}: holds a run with other settings: {told}")
     if kept.budget != preset.budget and kept.ppo.last_learning_rate is not None:
         raise SettingsError(f"{folder}: its learning rate falls over its budget, {kept.budget}, which stays what it is")
     return kept
@@ -86,19 +146,42 @@ def settings_of(preset: Preset) -> dict[str, Any]:
     return {name: value for name, value in preset.to_dict().items() if name != "budget"}
 
 
-def check_settings(saved: Checkpoint, preset: Preset, path: Path) -> None:
+def check_settings(saved: Checkpoint, preset: Preset, path: Path, classes: Iterable[Any] = ()) -> None:
     """Find out whether a preset, read from ``path``, is still that of the run which wrote a checkpoint.
+
+    ``classes`` are a user's own that its scenario and its reward name.
 
     Raises:
         SettingsError: it was changed; the message names the fields.
     """
-    then, now = saved.facts.get(SETTINGS), settings_of(preset)  # earlier versions did not tell
-    if then is not None and then != now:
-        changed = sorted(name for name in {*then, *now} if then.get(name) != now.get(name))
+    then = saved.facts.get(SETTINGS)
+    if then is None:  # earlier versions did not tell
+        return
+    with suppress(SettingsError):  # what an earlier version did not know has its default
+        then = settings_of(Preset.from_dict(then, classes))
+    apart = list(_differences(then, settings_of(preset)))
+    if apart:
+        told = "; ".join(f"{name}, now {_told(now)}, was {_told(before)}" for name, before, now in apart)
         raise SettingsError(
-            f"{path}: {', '.join(changed)} changed since the run began, which can go on only as it was: undo that, and "
-            "train what you want in another folder, by a copy of the file given as --preset"
+            f"{path}: changed since the run began, which can go on only as it was: {told}. Undo that, and train what "
+            "you want in another folder, by a copy of the file given as --preset"
         )
+
+
+def _differences(one: Mapping[str, Any], other: Mapping[str, Any], place: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Dotted name and both values of what differs between plain data; None where one of them has it not."""
+    for name in sorted({*one, *other}):
+        a, b = one.get(name), other.get(name)
+        if isinstance(a, Mapping) and isinstance(b, Mapping):
+            yield from _differences(a, b, f"{place}{name}.")
+        elif a != b:
+            yield f"{place}{name}", a, b
+
+
+def _told(value: Any) -> str:
+    """A value in a message."""
+    text = "not given" if value is None else repr(value)
+    return text if len(text) <= MOST_TOLD else f"{text[:MOST_TOLD]}.."
 
 
 @contextmanager
@@ -130,13 +213,21 @@ def ended(saved: Checkpoint, n_rollouts: int, seconds: float = math.inf) -> bool
     return bool(saved.facts["rollouts"] >= n_rollouts or saved.facts["seconds"] >= seconds)
 
 
-def is_policy_of(path: Path, **training: int) -> bool:
-    """Whether a whole policy lies there that was trained so: a kill may have come before, or in the middle."""
+def is_policy_of(path: Path, weights: Weights | None = None, **training: int) -> bool:
+    """Whether a whole policy lies there that was trained so: a kill may have come before, or in the middle.
+
+    With ``weights``, also whether they are its: two runs count the same shepherd-steps, whatever they learned.
+    """
     try:
-        told = load_policy(path).spec.training
+        policy = load_policy(path)
     except PolicyError:
         return False
-    return all(told.get(name) == value for name, value in training.items())
+    if any(policy.spec.training.get(name) != value for name, value in training.items()):
+        return False
+    own = policy.weights
+    return weights is None or (
+        set(own) == set(weights) and all(np.array_equal(own[name], weights[name]) for name in own)
+    )
 
 
 def exported(folder: Path, saved: Checkpoint) -> bool:

@@ -16,6 +16,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
 
+from shepherd_phys.controllers.network import Weights
 from shepherd_phys.envs.team import TeamVecEnv
 from shepherd_phys.learning.export import _actor, load_actor
 from shepherd_phys.learning.network import TeamPolicy
@@ -39,14 +40,23 @@ class Learner:
         n_workers: processes for the worlds; 0: this one. Results do not depend on it.
         logger: of stable-baselines3, for TensorBoard.
         fresh: whether the run begins here; else `restore` is called next, and the preset's ``init`` is not needed.
+        start: weights to begin with; None: those of the preset's ``init``, if it names one.
 
     Raises:
         SettingsError: the policy that the preset names as ``init`` cannot be had, or does not fit.
     """
 
-    def __init__(self, preset: Preset, n_workers: int = 0, logger: Logger | None = None, fresh: bool = True) -> None:
+    def __init__(
+        self,
+        preset: Preset,
+        n_workers: int = 0,
+        logger: Logger | None = None,
+        fresh: bool = True,
+        start: Weights | None = None,
+    ) -> None:
         self.preset = preset
-        start = preset.start() if fresh else None
+        if fresh and start is None:
+            start = preset.start()
         torch.set_num_threads(preset.threads)
         ppo = preset.ppo
         self.env = TeamVecEnv(
@@ -108,9 +118,14 @@ class Learner:
         set_random_seed(int(sequence.generate_state(1)[0]))
 
     def restart(self, number: int) -> None:
-        """Begin anew in all worlds and with all generators; what was under way has been bootstrapped by the rollout."""
+        """Begin anew in all worlds and with all generators; what was under way has been bootstrapped by the rollout.
+
+        Raises:
+            TrainingError: an observation is not finite; the message names it.
+        """
         self._seed_learner(number)
         observation = self.env.restart(number)
+        _check_finite(_named(observation))
         self.rewards.returns = np.zeros(self.env.num_envs)
         self.model._last_obs = observation
         self.model._last_episode_starts = np.ones(self.env.num_envs, dtype=bool)
@@ -135,6 +150,8 @@ class Learner:
             # who logs has more to tell of a rollout when it has been learned from: nothing is dumped in here
             model.learn(n, callback=watch, reset_num_timesteps=False, log_interval=sys.maxsize)
         except ValueError as error:  # torch's distributions refuse a NaN before anybody else sees it
+            if getattr(error, "__notes__", ()):  # a user's own code raised it, in the world that they name
+                raise
             self._check_parameters()
             raise TrainingError(f"learning failed: {' '.join(str(error).split())[:300]}") from error
         self.rollouts += 1
@@ -231,6 +248,22 @@ EPISODE = {"episode_reward": "return", "in_goal": "in_goal", "path_length": "pat
 """Measures of whole episodes in the curve, and their names in the env's infos."""
 
 
+def _named(observation: Mapping[str, Array]) -> dict[str, Array]:
+    return {f"observation {name!r}": array for name, array in observation.items()}
+
+
+def _check_finite(arrays: Mapping[str, Array | torch.Tensor]) -> None:
+    """Refuse a NaN and an infinity.
+
+    Raises:
+        TrainingError: names the array.
+    """
+    for name, array in arrays.items():
+        finite = torch.isfinite(array).all() if isinstance(array, torch.Tensor) else np.isfinite(array).all()
+        if not finite:
+            raise TrainingError(f"{name}: holds a NaN or an infinity: training stops")
+
+
 class _Watch(BaseCallback):
     """Looks at every decision: nothing may be NaN; gathers what whole episodes came to."""
 
@@ -240,12 +273,8 @@ class _Watch(BaseCallback):
 
     def _on_step(self) -> bool:
         seen = self.locals
-        arrays = {"rewards": seen["rewards"], **{f"observation {k!r}": v for k, v in seen["new_obs"].items()}}
-        arrays |= {name: seen[name] for name in ("actions", "values", "log_probs")}
-        for name, array in arrays.items():
-            finite = torch.isfinite(array).all() if isinstance(array, torch.Tensor) else np.isfinite(array).all()
-            if not finite:
-                raise TrainingError(f"{name}: holds a NaN or an infinity: training stops")
+        arrays = {name: seen[name] for name in ("actions", "values", "log_probs")}
+        _check_finite({"rewards": seen["rewards"], **_named(seen["new_obs"]), **arrays})
         worlds: dict[int, list[dict[str, Any]]] = {}
         for info in seen["infos"]:
             if "episode" in info:

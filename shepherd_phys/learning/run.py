@@ -28,19 +28,23 @@ from shepherd_phys.learning.folder import (
     PRESET,
     SETTINGS,
     TENSORBOARD,
+    UNJUDGED,
     VALIDATION,
     VALIDATION_COLUMNS,
     Table,
     agree,
     alone,
+    check_resumable,
     check_settings,
     ended,
     is_policy_of,
     settings_of,
+    start_of,
 )
 from shepherd_phys.learning.ppo import Learner
 from shepherd_phys.learning.preset import Preset
-from shepherd_phys.learning.validation import Validator, validator
+from shepherd_phys.learning.validation import ValidationError, Validator, validator
+from shepherd_phys.workers import WorkersError
 
 
 class Progress(NamedTuple):
@@ -98,9 +102,10 @@ def train(
         the best policy.
 
     Raises:
-        SettingsError: another process trains in the folder; it holds another run, or its preset was changed; or the
-            policy to start from cannot be had.
+        SettingsError: another process trains in the folder; it holds another run, its preset was changed, or its
+            checkpoints are gone; or the policy to start from cannot be had.
         TrainingError: something is not finite.
+        ValidationError, WorkersError: a validation failed; nothing learned is lost, and the run goes on with it.
         CheckpointError: a checkpoint cannot be written, or none of those there can be read, or gone on from.
     """
     with alone(folder):
@@ -110,12 +115,15 @@ def train(
             preset = kept
         newest = saved = checkpoints.load_latest(folder / CHECKPOINTS)
         if newest is not None:
-            check_settings(newest, preset, folder / PRESET)
+            check_settings(newest, preset, folder / PRESET, classes)
             if not ended(newest, n_rollouts, seconds):
                 saved = _gone_on_from(newest, preset, folder / CHECKPOINTS)
+        else:
+            check_resumable(folder, preset)
+        start = start_of(folder, preset) if saved is None else None
         decisions = 0 if saved is None else int(saved.facts["decisions"])
         logger = Logger(str(folder / TENSORBOARD), [_TensorBoard(folder / TENSORBOARD, decisions)])
-        learner = Learner(preset, n_workers if n_workers > 1 else 0, logger, fresh=saved is None)
+        learner = Learner(preset, n_workers if n_workers > 1 else 0, logger, saved is None, start)
         try:
             with validator(preset, n_workers) as validate:
                 # only now: until here a mistake leaves the run as it was
@@ -124,10 +132,10 @@ def train(
                 if newest is not None and saved is not newest:
                     _forget(folder, newest, saved)
                 run = _Run(folder, learner, validate, report, saved, n_rollouts, seconds)
-                while not run.over:
-                    run.interval()
-                    if run.over or run.number % preset.validation.every == 0:
-                        run.judge()
+                while run.unjudged or not run.over:
+                    if not run.unjudged:
+                        run.interval()
+                    run.judge_in_turn()
                     run.save()
                 return run.chosen.get(BEST)
         finally:
@@ -210,6 +218,8 @@ class _Run:
         self._folder, self._learner, self._validate, self._report = folder, learner, validate, report
         self._n_rollouts, self._limit = n_rollouts, limit
         self._out_of_turn = False
+        self.unjudged = saved is not None and bool(saved.facts.get(UNJUDGED, False))
+        """Whether the validation that is the newest interval's failed, and is still to be made."""
         self.number = 0
         self.chosen: dict[str, Chosen] = {}
         """By the file that holds it."""
@@ -219,7 +229,7 @@ class _Run:
             self.number, self.chosen, seconds = saved.number, _chosen_of(saved), float(saved.facts["seconds"])
             self._export()  # the kill may have come between the two files of a policy
         self._curve = Table(folder / CURVE, CURVE_COLUMNS, learner.rollouts)
-        self._validations = Table(folder / VALIDATION, VALIDATION_COLUMNS, self.number)
+        self._validations = Table(folder / VALIDATION, VALIDATION_COLUMNS, self.number - self.unjudged)
         self._clock, self._seconds = _Clock(seconds, learner.shepherd_steps), seconds
         self._measures: dict[str, float] = {}
         self.over = saved is not None and ended(saved, n_rollouts, limit)
@@ -252,10 +262,26 @@ class _Run:
         self._seconds = self._clock.seconds()
         self.over = learner.rollouts >= self._n_rollouts or self._seconds >= self._limit
 
-    def judge(self) -> None:
+    def judge_in_turn(self) -> None:
+        """Validate where it is the interval's turn, or the run's end.
+
+        Raises:
+            ValidationError, WorkersError: an episode did not end; the interval is saved as one that is not judged.
+        """
+        self._out_of_turn = self.number % self._learner.preset.validation.every != 0
+        if self._out_of_turn and not self.over:
+            return
+        try:
+            self._judge()
+        except (ValidationError, WorkersError):
+            self.unjudged = True
+            self.save()
+            raise
+        self.unjudged = False
+
+    def _judge(self) -> None:
         """Validate the policy; keep it if it is the best so far, or the first that passes."""
         learner, logger = self._learner, self._learner.model.logger
-        self._out_of_turn = self.number % learner.preset.validation.every != 0
         steps = learner.shepherd_steps
         policy = to_policy(learner.model, spec_of(learner.preset, steps))
         with self._clock.stopped():
@@ -277,7 +303,9 @@ class _Run:
     def save(self) -> None:
         """Write the checkpoint and the policies."""
         arrays, facts = self._learner.state()
-        facts |= {"seconds": self._seconds, "out_of_turn": self._out_of_turn}
+        facts |= {"seconds": self._seconds, "out_of_turn": self._out_of_turn and self.over}
+        if self.unjudged:
+            facts[UNJUDGED] = True
         facts[SETTINGS] = settings_of(self._learner.preset)
         for file, kept in self.chosen.items():
             key = Path(file).stem
@@ -295,7 +323,7 @@ class _Run:
         for file, (steps, own) in policies.items():
             # the first keeps the budget of its day: its trials are known by its checksum
             same = {} if file == FIRST else {"budget": learner.preset.budget}
-            if not is_policy_of(self._folder / file, shepherd_steps=steps, **same):
+            if not is_policy_of(self._folder / file, own, shepherd_steps=steps, **same):
                 write_policy(self._folder / file, spec_of(learner.preset, steps), own)
 
     def _tell(self, validation: Sequence[Mapping[str, Any]]) -> None:

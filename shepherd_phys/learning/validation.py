@@ -17,7 +17,7 @@ from shepherd_phys.envs.shepherding import ShepherdingEnv
 from shepherd_phys.learning.folder import MEASURES
 from shepherd_phys.learning.preset import Preset
 from shepherd_phys.scenario import Scenario, with_neighbours
-from shepherd_phys.workers import Job, Workers, finished
+from shepherd_phys.workers import Job, Workers, explain, finished
 
 TIMEOUT = 600.0
 """An episode that takes longer is lost [s]."""
@@ -74,7 +74,11 @@ class Validator:
         ]
         rows: dict[tuple[int, int], Mapping[str, Any]] = {}
         if self._workers is None:
-            rows = {job.key: episode(job.spec, job.seed) for job in jobs}
+            for job in jobs:
+                try:
+                    rows[job.key] = episode(job.spec, job.seed)
+                except Exception as error:  # a user's own code may raise anything
+                    raise ValidationError(f"validation, seed {job.seed}: {explain(error)}") from error
         else:
             for ended in finished(self._workers, deque(jobs)):
                 if ended.result is None:
