@@ -58,37 +58,46 @@ def check_sight(lidar: Lidar, field: str) -> None:
         raise SettingsError(f"{field}: needs the frame 'goal' and the channel of sheep (given: {lidar})")
 
 
-def home_herd(frames: NDArray[np.float32], offset: NDArray[np.int64], lidar: Lidar, home: float) -> NDArray[np.float64]:
-    """How far the goal's centre is (P,) [m] for those who see the herd home; NaN for others.
-
-    They see the goal from outside, and sheep, none of them further outside its border than ``home``.
+class HomeHerd:
+    """Tells shepherds that see the herd home how far the goal's centre is.
 
     Args:
-        frames: (P, stack, channels, beams) proximities of all beams in the world frame, newest last.
-        offset: (P,) the beams that point at the goal.
         lidar: the settings.
-        home: [m].
+        home: so far outside the goal's border a sheep is still home [m].
     """
-    distances = np.full(len(frames), np.nan)
-    _home_herd(
-        frames[:, -1], lidar.channels.index("goal"), lidar.channels.index("sheep"), lidar.goal_range, lidar.range,
-        beam_directions(lidar.beams), offset, home, distances,
-    )  # fmt: skip
-    return distances
+
+    def __init__(self, lidar: Lidar, home: float) -> None:
+        rows = lidar.channels.index("goal"), lidar.channels.index("sheep")
+        self._settings = (*rows, lidar.goal_range, lidar.range, beam_directions(lidar.beams), home)
+
+    def __call__(self, frames: NDArray[np.float32], offset: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Distances (P,) of the goal's centre [m] for those who see the herd home; NaN for others.
+
+        They see the goal from outside, and sheep, none of them further outside its border than ``home``.
+
+        Args:
+            frames: (P, stack, channels, beams) proximities of all beams in the world frame, newest last.
+            offset: (P,) the beams that point at the goal.
+        """
+        distances = np.empty(len(frames))
+        _home_herd(frames, offset, distances, *self._settings)
+        return distances
 
 
 @njit(cache=True, error_model="numpy")
-def _home_herd(frame, goal, sheep, goal_range, sheep_range, directions, offset, home, out):  # type: ignore[no-untyped-def]
-    """Of the rows ``goal`` and ``sheep`` of (P, channels, beams).
+def _home_herd(frames, offset, out, goal, sheep, goal_range, sheep_range, directions, home):  # type: ignore[no-untyped-def]
+    """Of the rows ``goal`` and ``sheep`` of the newest frame.
 
     A disc of radius r whose centre is d away looks 2 a wide, sin a = r / d, and its nearest point is d - r away. Its
     width is that of the circle without the widest gap between lit beams: beams that are lost within it do not matter.
     """
-    n, _, beams = frame.shape
+    n, stack, _, beams = frames.shape
+    out[:] = math.nan
     for p in range(n):
+        goals, flock = frames[p, stack - 1, goal], frames[p, stack - 1, sheep]
         first, last, gap, near = -1, -1, 0, 0.0
         for k in range(beams):
-            x = frame[p, goal, k]
+            x = goals[k]
             if x > 0.0:
                 if first < 0:
                     first = k
@@ -104,9 +113,9 @@ def _home_herd(frame, goal, sheep, goal_range, sheep_range, directions, offset, 
         far = centre - border + home
         x, y = centre * directions[0, offset[p]], centre * directions[1, offset[p]]
         for k in range(beams):
-            if frame[p, sheep, k] > 0.0:
+            if flock[k] > 0.0:
                 out[p] = centre
-                d = sheep_range * (1.0 - frame[p, sheep, k])
+                d = sheep_range * (1.0 - flock[k])
                 if math.hypot(d * directions[0, k] - x, d * directions[1, k] - y) > far:
                     out[p] = math.nan
                     break

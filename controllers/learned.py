@@ -17,7 +17,7 @@ from shepherd_phys.lidar import Lidar, beam_directions
 from shepherd_phys.observation import observe
 from shepherd_phys.state import WorldState
 
-from .hold import home_herd
+from .hold import HomeHerd
 from .network import Actor
 from .policy_files import PolicySpec, read_policy
 from .wander import Wanderer
@@ -56,6 +56,11 @@ class Policy:
         hold = spec.action.hold
         deep = math.inf if hold is None or hold.inside is None else hold.inside
         self._limits = (0.0 if hold is None else hold.rest, deep)
+        wander = spec.action.wander
+        if hold is not None:
+            self._home_to_hold = HomeHerd(spec.lidar, hold.home)
+        if wander is not None:
+            self._home_to_stay = HomeHerd(spec.lidar, wander.home)
         self._chance = np.zeros((0, 2))
         self._offset: NDArray[np.int64] | None = None
         self._action: NDArray[np.float64] | None = None
@@ -100,20 +105,23 @@ class Policy:
         if acting.noise and (self._action is None or state.step % acting.noise_steps == 0):
             self._chance = acting.noise * self._rng.standard_normal((n, 2))
         if self._action is None or state.step % self._interval == 0:
+            if self._mirrored is None:
+                self._mirrored = mirror.mirrored(acting.mirror, observation, self._observed)
             if acting.mirror != "never":
-                if self._mirrored is None:
-                    self._mirrored = mirror.mirrored(acting.mirror, observation, self._observed)
                 observation = mirror.seen(observation, self._mirrored)
-            mean, deviation = self._actor(observation)
-            action = mean + self._chance * deviation if acting.noise else mean
-            if self._mirrored is not None:
-                action = mirror.meant(action, self._mirrored)
-            hold, outside = acting.hold, np.full(n, np.nan)
+            mean, deviation = self._actor(observation), self._actor.deviation
+            chance = self._chance if acting.noise else np.zeros((n, 2))
+            hold = acting.hold
             if hold is not None and n >= hold.team:
-                outside = home_herd(frames, self._offset, self._observed, hold.home) - hold.ring
-            self._action = _wanted(action, self._offset, self._directions, acting.rest, outside, self._limits)
+                outside = self._home_to_hold(frames, self._offset) - hold.ring
+            else:
+                outside = np.full(n, np.nan)
+            self._action = _wanted(
+                mean, chance, deviation, self._mirrored, self._offset, self._directions, acting.rest, outside,
+                self._limits,
+            )  # fmt: skip
             if self._wanderer is not None:
-                home = np.isfinite(home_herd(frames, self._offset, self._observed, self._wanderer.settings.home))
+                home = np.isfinite(self._home_to_stay(frames, self._offset))
                 self._action = self._wanderer(self._action, home)
         return self._action.copy()
 
@@ -123,18 +131,22 @@ class Policy:
 
 
 @njit(cache=True, error_model="numpy")
-def _wanted(actions, offset, directions, rest, outside, limits):  # type: ignore[no-untyped-def]
-    """Actions (P, 2) of a network as the world takes them.
+def _wanted(mean, chance, deviation, mirrored, offset, directions, rest, outside, limits):  # type: ignore[no-untyped-def]
+    """Actions (P, 2) of a network as the world takes them: everything in one call, which costs less than its parts.
 
-    Clipped to [-1, 1], as while learning, and to the unit disc, as the world does; 0 where shorter than ``rest``;
-    turned by the angle of beam ``offset`` (P,), as `shepherd_phys.observation.turn` does. ``outside`` (P,) is how far
-    those who hold are outside their ring [m], NaN for others; ``limits`` are theirs: what is short for them in place of
-    ``rest``, and how far inside the ring they may stand [m].
+    That is the ``mean`` and ``chance`` (P, 2) standard deviations (2,); of those who see in a mirror, ``mirrored``
+    (P,), what `shepherd_phys.mirror.meant` makes of it. Clipped to [-1, 1], as while learning, and to the unit disc, as
+    the world does; 0 where shorter than ``rest``; turned by the angle of beam ``offset`` (P,), as
+    `shepherd_phys.observation.turn` does. ``outside`` (P,) is how far those who hold are outside their ring [m], NaN
+    for others; ``limits`` are theirs: what is short for them in place of ``rest``, and how far inside the ring they may
+    stand [m].
     """
-    wanted = np.empty(actions.shape)
-    for p in range(len(actions)):
-        x = min(max(np.float64(actions[p, 0]), -1.0), 1.0)
-        y = min(max(np.float64(actions[p, 1]), -1.0), 1.0)
+    wanted = np.empty(mean.shape)
+    for p in range(len(mean)):
+        x = mean[p, 0] + chance[p, 0] * deviation[0]
+        y = mean[p, 1] + chance[p, 1] * deviation[1]
+        x = min(max(x, -1.0), 1.0)
+        y = min(max(-y if mirrored[p] else y, -1.0), 1.0)
         slow = rest
         if not math.isnan(outside[p]):
             slow, deep = limits

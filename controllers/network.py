@@ -142,10 +142,11 @@ class Actor:
             for name in ("groups", "hidden", "latent", "action")
             for array in (np.array(weights[f"{name}.weight"].T, order="C"), np.array(weights[f"{name}.bias"]))
         ]
-        self._deviation = np.exp(weights["log_std"])
+        self.deviation = np.exp(weights["log_std"])
+        """(2,) standard deviations of every action."""
 
-    def __call__(self, observation: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Means and standard deviations (P, 2), not clipped, of the actions for P observations (P, R, C) float32."""
+    def __call__(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Means (P, 2), not clipped, of the actions for P observations (P, R, C) float32."""
         if observation.shape[1:] != self._shape:
             raise ValueError(
                 f"observation: needs the shape (P, {self._shape[0]}, {self._shape[1]}), has {observation.shape}"
@@ -153,14 +154,15 @@ class Actor:
         means: NDArray[np.float32] = _forward(
             np.ascontiguousarray(observation, np.float32), self._group, self._overlap, *self._layers
         )
-        return means, np.broadcast_to(self._deviation, means.shape)
+        return means
 
 
 @njit(cache=True, error_model="numpy")
 def _forward(observation, group, overlap, w1, b1, w2, b2, w3, b3, w4, b4):  # type: ignore[no-untyped-def]
     """As `SectorNetwork` says, weights input by input: (inputs, outputs).
 
-    Most of what a lidar observes is 0, and so is half of what a relu gives: both are skipped.
+    Most of what a lidar observes is 0, and so is half of what a relu gives: both are skipped. Rows of arrays are taken
+    out of the loops over their numbers, which makes these twice as fast.
     """
     n, rows, columns = observation.shape
     groups, features = columns // group, len(b1)
@@ -170,45 +172,48 @@ def _forward(observation, group, overlap, w1, b1, w2, b2, w3, b3, w4, b4):  # ty
     shared[:] = b1
     for p in range(n):
         for r in range(rows):
+            seen = observation[p, r]
             for c in range(columns):
-                x = observation[p, r, c]
+                x = seen[c]
                 if x != 0.0:
                     for near in range(c // group - reach, c // group + reach + 1):
                         k = c - near * group + overlap
                         if 0 <= k < width:
                             _add(shared[p, near % groups], x, w1[r * width + k])
-    inputs = shared.reshape(n, groups * features)
-    hidden = np.empty((n, len(b2)), np.float32)
-    hidden[:] = b2
-    _add_layer(hidden, inputs, w2)
-    latent = np.empty((n, len(b3)), np.float32)
-    latent[:] = b3
-    _add_layer(latent, hidden, w3)
+    hidden = _layer(shared.reshape(n, groups * features), w2, b2)
+    latent = _layer(hidden, w3, b3)
     action = np.empty((n, 2), np.float32)
-    action[:] = b4
     for p in range(n):
+        x, y = b4[0], b4[1]
         for j in range(len(b3)):
-            _add(action[p], np.tanh(latent[p, j]), w4[j])
+            z = np.tanh(latent[p, j])
+            x += z * w4[j, 0]
+            y += z * w4[j, 1]
+        action[p, 0], action[p, 1] = x, y
     return action
 
 
 @njit(cache=True, error_model="numpy")
-def _add_layer(out, inputs, weights):  # type: ignore[no-untyped-def]
-    """Add relu(inputs) @ weights; four inputs at a time, since the way to memory is what takes time."""
+def _layer(inputs, weights, bias):  # type: ignore[no-untyped-def]
+    """Bias + relu(inputs) @ weights; four inputs at a time, since the way to memory is what takes time."""
+    out = np.empty((len(inputs), len(bias)), np.float32)
+    out[:] = bias
     lit = np.empty(inputs.shape[1], np.int64)
     for p in range(len(out)):
-        n = 0
-        for j in range(inputs.shape[1]):
-            if inputs[p, j] > 0.0:
+        row, total, n = inputs[p], out[p], 0
+        for j in range(len(row)):
+            if row[j] > 0.0:
                 lit[n] = j
                 n += 1
         for q in range(0, n - n % 4, 4):
             a, b, c, d = lit[q], lit[q + 1], lit[q + 2], lit[q + 3]
-            xa, xb, xc, xd = inputs[p, a], inputs[p, b], inputs[p, c], inputs[p, d]
-            for i in range(out.shape[1]):
-                out[p, i] += xa * weights[a, i] + xb * weights[b, i] + xc * weights[c, i] + xd * weights[d, i]
+            xa, xb, xc, xd = row[a], row[b], row[c], row[d]
+            wa, wb, wc, wd = weights[a], weights[b], weights[c], weights[d]
+            for i in range(len(total)):
+                total[i] += xa * wa[i] + xb * wb[i] + xc * wc[i] + xd * wd[i]
         for q in range(n - n % 4, n):
-            _add(out[p], inputs[p, lit[q]], weights[lit[q]])
+            _add(total, row[lit[q]], weights[lit[q]])
+    return out
 
 
 @njit(cache=True, error_model="numpy")

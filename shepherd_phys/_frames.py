@@ -56,23 +56,41 @@ def rolled_sectors(rows: Any, offsets: Ints, out: Any) -> None:
     """Roll rows (P, R, beams) float32 so that beam ``offsets[p]`` comes first, and write the greatest of each sector.
 
     ``out`` is (P, R, sectors) float32; sector j holds beams s j - s // 2 .. of the rolled row, s = beams / sectors.
+    Two stretches of 1, 2, 4 .. beams, which may overlap, make a sector.
     """
     n, n_rows, beams = rows.shape
     sectors = out.shape[2]
     size = beams // sectors
+    line, spare = np.empty(beams, np.float32), np.empty(beams, np.float32)
     for p in range(n):
         start = (offsets[p] - size // 2) % beams
         for i in range(n_rows):
-            low = start
+            row, sector = rows[p, i], out[p, i]
+            _copy(row[start:], line)
+            _copy(row[:start], line[beams - start :])
+            greatest, other, reach = line, spare, 1
+            while 2 * reach <= size:
+                _greater(greatest, reach, other)
+                greatest, other = other, greatest
+                reach *= 2
             for j in range(sectors):
-                high = low + size
-                best = rows[p, i, low]
-                for k in range(low + 1, min(high, beams)):
-                    best = rows[p, i, k] if rows[p, i, k] > best else best
-                for k in range(high - beams):  # the sector that goes round the end
-                    best = rows[p, i, k] if rows[p, i, k] > best else best
-                out[p, i, j] = best
-                low = high if high < beams else high - beams
+                a, b = greatest[size * j], greatest[size * (j + 1) - reach]
+                sector[j] = a if a > b else b
+
+
+@njit(cache=True, error_model="numpy")
+def _copy(line: Any, out: Any) -> None:
+    """Write ``line`` to where ``out`` begins."""
+    for k in range(len(line)):
+        out[k] = line[k]
+
+
+@njit(cache=True, error_model="numpy")
+def _greater(line: Any, reach: int, out: Any) -> None:
+    """Write the greater of each number and the one ``reach`` further on: a loop that works on many at once."""
+    further = line[reach:]
+    for k in range(len(further)):
+        out[k] = line[k] if line[k] > further[k] else further[k]
 
 
 @njit(cache=True)

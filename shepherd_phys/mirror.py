@@ -48,7 +48,10 @@ def seen(observation: NDArray[np.float32], who: NDArray[np.bool_]) -> NDArray[An
 
     Column 0 stays where it is. Of sectors it is half a beam off its own mirror image.
     """
-    return np.where(who[:, None, None], observation[:, :, -np.arange(observation.shape[2])], observation)
+    shown = observation.copy()
+    if who.any():
+        shown[who, :, 1:] = observation[who, :, :0:-1]
+    return shown
 
 
 def meant(actions: NDArray[Any], who: NDArray[np.bool_]) -> NDArray[Any]:

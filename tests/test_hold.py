@@ -12,7 +12,7 @@ from test_learned import SMALL, random_weights, spec_of
 
 from shepherd_phys.controllers import POLICIES, Policy
 from shepherd_phys.controllers.evaluation import run_episode, trial_seed
-from shepherd_phys.controllers.hold import Hold, home_herd
+from shepherd_phys.controllers.hold import Hold, HomeHerd
 from shepherd_phys.controllers.policy_files import PolicyError
 from shepherd_phys.envs import ShepherdingEnv
 from shepherd_phys.layouts import Scattered
@@ -36,7 +36,7 @@ def frames(sheep, shepherds, goal=(0.0, 0.0), lidar=LIDAR, goal_radius=2.5):
 
 
 def herd(sheep, shepherds, home=3.0, **how):
-    return home_herd(*frames(sheep, shepherds, **how), LIDAR, home)
+    return HomeHerd(LIDAR, home)(*frames(sheep, shepherds, **how))
 
 
 AROUND = ((14.0, 0.0), (0.0, -8.5), (-9.0, 12.0))
@@ -61,19 +61,19 @@ def test_nobody_holds_inside_the_goal_or_without_sight_of_it_or_of_sheep():
     assert np.isfinite(herd(HOME, ((14.0, 0.0), (1.0, 0.0), (0.0, 9.0)))).tolist() == [True, False, True]
     seen, offset = frames(HOME, AROUND)
     seen[1, :, LIDAR.channels.index("goal")] = 0.0
-    assert np.isfinite(home_herd(seen, offset, LIDAR, 3.0)).tolist() == [True, False, True]
+    assert np.isfinite(HomeHerd(LIDAR, 3.0)(seen, offset)).tolist() == [True, False, True]
     seen, offset = frames(HOME, AROUND)
     seen[1, :, LIDAR.channels.index("sheep")] = 0.0
-    assert np.isfinite(home_herd(seen, offset, LIDAR, 3.0)).tolist() == [True, False, True]
+    assert np.isfinite(HomeHerd(LIDAR, 3.0)(seen, offset)).tolist() == [True, False, True]
 
 
 def test_lost_beams_change_it_little():
     seen, offset = frames(HOME, AROUND)
-    whole = home_herd(seen, offset, LIDAR, 3.0)
+    whole = HomeHerd(LIDAR, 3.0)(seen, offset)
     for seed in range(20):
         lost = (seen * (np.random.default_rng(seed).random(seen.shape) > 0.1)).astype(np.float32)
         turned = observe(lost, np.zeros(3, np.int64), LIDAR)[1]
-        assert home_herd(lost, turned, LIDAR, 3.0) == pytest.approx(whole, abs=0.4)
+        assert HomeHerd(LIDAR, 3.0)(lost, turned) == pytest.approx(whole, abs=0.4)
 
 
 def test_it_goes_by_the_newest_frame_whatever_the_channels_and_sectors():
@@ -84,9 +84,9 @@ def test_it_goes_by_the_newest_frame_whatever_the_channels_and_sectors():
         LIDAR.but(stack=2, channels=("sheep", "shepherds", "goal", "obstacles")),
     ):
         (newest, _), (older, _) = (frames(sheep, AROUND, lidar=lidar) for sheep in (HOME, (*HOME, (0.0, -6.0))))
-        told = home_herd(np.concatenate((older, newest), axis=1), offset, lidar, 3.0)
-        np.testing.assert_array_equal(told, home_herd(whole, offset, LIDAR, 3.0))
-        assert np.isnan(home_herd(np.concatenate((newest, older), axis=1), offset, lidar, 3.0)).all()
+        told = HomeHerd(lidar, 3.0)(np.concatenate((older, newest), axis=1), offset)
+        np.testing.assert_array_equal(told, HomeHerd(LIDAR, 3.0)(whole, offset))
+        assert np.isnan(HomeHerd(lidar, 3.0)(np.concatenate((newest, older), axis=1), offset)).all()
 
 
 def test_on_the_border_half_of_the_beams_see_the_goal_and_nobody_holds():
@@ -94,9 +94,9 @@ def test_on_the_border_half_of_the_beams_see_the_goal_and_nobody_holds():
     row = seen[0, 0, LIDAR.channels.index("goal")]
     row[:] = 0.0
     row[:255] = 0.999
-    assert np.isfinite(home_herd(seen, offset, LIDAR, 40.0)[0])
+    assert np.isfinite(HomeHerd(LIDAR, 40.0)(seen, offset)[0])
     row[255] = 0.999
-    assert np.isnan(home_herd(seen, offset, LIDAR, 40.0)[0])
+    assert np.isnan(HomeHerd(LIDAR, 40.0)(seen, offset)[0])
 
 
 @hypothesis_settings(max_examples=30, deadline=None)

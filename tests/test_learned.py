@@ -87,7 +87,7 @@ def test_the_network_is_its_formulas(overlap, density):
     rng = np.random.default_rng(1)
     observation = rng.random((4, 6, 16), dtype=np.float32) * (rng.random((4, 6, 16)) < density)
     wanted = [by_hand(weights, network, one) for one in observation]
-    assert Actor(network, LIDAR, weights)(observation)[0] == pytest.approx(np.array(wanted), abs=1e-5)
+    assert Actor(network, LIDAR, weights)(observation) == pytest.approx(np.array(wanted), abs=1e-5)
 
 
 def test_a_turn_by_a_group_only_permutes_the_groups():
@@ -99,8 +99,8 @@ def test_a_turn_by_a_group_only_permutes_the_groups():
     turned["hidden.bias"] = weights["hidden.bias"]
     observation = np.random.default_rng(2).random((1, 6, 16), dtype=np.float32)
     rolled = np.roll(observation, 4, axis=2)
-    wanted = Actor(network, LIDAR, turned)(rolled)[0]
-    assert Actor(network, LIDAR, weights)(observation)[0] == pytest.approx(wanted, abs=1e-6)
+    wanted = Actor(network, LIDAR, turned)(rolled)
+    assert Actor(network, LIDAR, weights)(observation) == pytest.approx(wanted, abs=1e-6)
 
 
 def test_what_is_written_is_read(policy_path):
@@ -141,7 +141,7 @@ def test_actions_lie_in_the_unit_disc(seed):
     observation = np.random.default_rng(seed).random((5, 3, 16), dtype=np.float32)
     action = policy.act(observation, STATE)
     assert (np.hypot(*action.T) <= 1 + 1e-12).all()
-    raw = np.clip(Actor(SMALL, lidar, weights)(observation)[0], -1, 1)
+    raw = np.clip(Actor(SMALL, lidar, weights)(observation), -1, 1)
     for a, b in zip(action, raw, strict=True):
         assert abs(a[0] * b[1] - a[1] * b[0]) < 1e-6 and a @ b >= 0  # the same direction
 
@@ -167,7 +167,8 @@ def test_chance_is_drawn_anew_after_its_time_in_proportion_to_the_deviation_and_
     for name in ("action.weight", "action.bias"):
         weights[name] *= 0.1
     seen = np.random.default_rng(1).random((5, 3, 16), dtype=np.float32)
-    mean, deviation = Actor(SMALL, lidar, weights)(seen)
+    actor = Actor(SMALL, lidar, weights)
+    mean, deviation = actor(seen), actor.deviation
 
     def acts(noise, seed, n_steps=7):
         policy = Policy(spec_of(lidar, noise=noise, noise_steps=3), weights)
@@ -200,7 +201,7 @@ def test_chance_rest_interval_and_the_goals_frame_go_together():
         if k % 3 == 0:
             chance = 0.5 * rng.standard_normal((len(seen), 2))
         if k % 2 == 0:
-            mean, deviation = actor(seen)
+            mean, deviation = actor(seen), actor.deviation
             raw = np.clip(mean + chance * deviation, -1, 1)
             speed = np.linalg.norm(raw, axis=1, keepdims=True)
             wanted = turn(np.where(speed < 0.4, 0.0, raw / np.maximum(speed, 1)), reference.beam_offset, 64)
