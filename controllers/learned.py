@@ -107,9 +107,7 @@ class Policy:
         if self._action is None or state.step % self._interval == 0:
             if self._mirrored is None:
                 self._mirrored = mirror.mirrored(acting.mirror, observation, self._observed)
-            if acting.mirror != "never":
-                observation = mirror.seen(observation, self._mirrored)
-            mean, deviation = self._actor(observation), self._actor.deviation
+            mean, deviation = self._actor(observation, self._mirrored), self._actor.deviation
             chance = self._chance if acting.noise else np.zeros((n, 2))
             hold = acting.hold
             if hold is not None and n >= hold.team:

@@ -124,6 +124,9 @@ def with_channels(weights: Weights, network: SectorNetwork, lidar: Lidar, wanted
     return {**weights, "groups.weight": wider.reshape(network.features, -1)}
 
 
+Means = NDArray[np.float32]
+
+
 class Actor:
     """The network with its weights, ready to run.
 
@@ -145,20 +148,26 @@ class Actor:
         self.deviation = np.exp(weights["log_std"])
         """(2,) standard deviations of every action."""
 
-    def __call__(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Means (P, 2), not clipped, of the actions for P observations (P, R, C) float32."""
+    def __call__(self, observation: NDArray[np.float32], mirrored: NDArray[np.bool_] | None = None) -> Means:
+        """Means (P, 2), not clipped, of the actions for P observations (P, R, C) float32.
+
+        Those of whom ``mirrored`` (P,) is true see theirs as `shepherd_phys.mirror.seen` shows it: columns are read the
+        other way round, which costs less than turning them.
+        """
         if observation.shape[1:] != self._shape:
             raise ValueError(
                 f"observation: needs the shape (P, {self._shape[0]}, {self._shape[1]}), has {observation.shape}"
             )
-        means: NDArray[np.float32] = _forward(
-            np.ascontiguousarray(observation, np.float32), self._group, self._overlap, *self._layers
+        if mirrored is None:
+            mirrored = np.zeros(len(observation), np.bool_)
+        means: Means = _forward(
+            np.ascontiguousarray(observation, np.float32), mirrored, self._group, self._overlap, *self._layers
         )
         return means
 
 
 @njit(cache=True, error_model="numpy")
-def _forward(observation, group, overlap, w1, b1, w2, b2, w3, b3, w4, b4):  # type: ignore[no-untyped-def]
+def _forward(observation, mirrored, group, overlap, w1, b1, w2, b2, w3, b3, w4, b4):  # type: ignore[no-untyped-def]
     """As `SectorNetwork` says, weights input by input: (inputs, outputs).
 
     Most of what a lidar observes is 0, and so is half of what a relu gives: both are skipped. Rows of arrays are taken
@@ -174,7 +183,7 @@ def _forward(observation, group, overlap, w1, b1, w2, b2, w3, b3, w4, b4):  # ty
         for r in range(rows):
             seen = observation[p, r]
             for c in range(columns):
-                x = seen[c]
+                x = seen[(columns - c) % columns] if mirrored[p] else seen[c]
                 if x != 0.0:
                     for near in range(c // group - reach, c // group + reach + 1):
                         k = c - near * group + overlap

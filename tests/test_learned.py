@@ -19,10 +19,11 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
+from shepherd_phys import mirror
 from shepherd_phys.bodies import Disc
 from shepherd_phys.controllers import CONTROLLERS, POLICIES, Policy, load_policy
 from shepherd_phys.controllers.evaluation import evaluate, trial_seed
-from shepherd_phys.controllers.network import Actor, SectorNetwork
+from shepherd_phys.controllers.network import Actor, SectorNetwork, input_shape
 from shepherd_phys.controllers.policy_files import (
     FIELDS,
     MAX_JSON,
@@ -158,6 +159,20 @@ def test_a_decision_is_held_for_its_interval():
         observation, *_ = env.step([[1.0, 0.0], [0.0, 1.0]])
     same = [np.array_equal(a, b) for a, b in itertools.pairwise(actions)]
     assert same == [True, True, False, True, True]
+
+
+@pytest.mark.parametrize("overlap", [0, 3])
+def test_who_sees_in_a_mirror_acts_as_if_shown_one(overlap):
+    network = SMALL.but(overlap=overlap)
+    weights = random_weights(network, LIDAR)
+    rng = np.random.default_rng(2)
+    rows, columns = input_shape(LIDAR)
+    seen = rng.random((5, rows, columns), dtype=np.float32) * (rng.random((5, rows, columns)) < 0.3)
+    who = np.array([True, False, True, False, True])
+    actor = Actor(network, LIDAR, weights)
+    np.testing.assert_array_equal(actor(seen, who), actor(mirror.seen(seen, who)))
+    assert not np.allclose(actor(seen, who)[0], actor(seen)[0])
+    np.testing.assert_array_equal(actor(seen, who)[1], actor(seen)[1])
 
 
 def test_chance_is_drawn_anew_after_its_time_in_proportion_to_the_deviation_and_from_the_seed():
