@@ -6,7 +6,10 @@ beyond what sheep feel and waits, nothing changes what it sees, and it stays for
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
@@ -62,15 +65,35 @@ class Wanderer:
             n = len(wanted)
             self._mean, self._way = wanted.copy(), np.zeros((n, 2))
             self._short, self._left = np.zeros(n, np.int64), np.zeros(n, np.int64)
-        self._mean += own.memory * (wanted - self._mean)
-        short = (np.hypot(*self._mean.T) < own.least) & ~home
-        self._short = np.where(short, self._short + 1, 0)
-        for p in np.flatnonzero((self._short >= own.after) & (self._left == 0)):
-            angle = self._rng.uniform(0.0, 2.0 * np.pi)
-            self._way[p] = np.cos(angle), np.sin(angle)
-            self._left[p] = self._rng.integers(own.shortest, own.longest, endpoint=True)
-            self._short[p] = 0
-        self._left[home] = 0
-        walks = self._left > 0
-        self._left[walks] -= 1
-        return np.where(walks[:, None], self._way, wanted)
+        if _wait(wanted, home, own.memory, own.least, own.after, self._mean, self._short, self._left):
+            for p in np.flatnonzero((self._short >= own.after) & (self._left == 0)):
+                angle = self._rng.uniform(0.0, 2.0 * np.pi)
+                self._way[p] = np.cos(angle), np.sin(angle)
+                self._left[p] = self._rng.integers(own.shortest, own.longest, endpoint=True)
+                self._short[p] = 0
+        done = wanted.copy()
+        _walk(home, self._way, self._left, done)
+        return done
+
+
+@njit(cache=True, error_model="numpy")
+def _wait(wanted, home, memory, least, after, mean, short, left):  # type: ignore[no-untyped-def]
+    """Count for how many decisions the mean has been short; whether somebody is to begin a walk."""
+    any_due = False
+    for p in range(len(wanted)):
+        mean[p, 0] += memory * (wanted[p, 0] - mean[p, 0])
+        mean[p, 1] += memory * (wanted[p, 1] - mean[p, 1])
+        short[p] = short[p] + 1 if math.hypot(mean[p, 0], mean[p, 1]) < least and not home[p] else 0
+        any_due = any_due or (short[p] >= after and left[p] == 0)
+    return any_due
+
+
+@njit(cache=True, error_model="numpy")
+def _walk(home, way, left, done):  # type: ignore[no-untyped-def]
+    """Write a step of the walks into ``done`` (P, 2); those of who sees the herd home end."""
+    for p in range(len(done)):
+        if home[p]:
+            left[p] = 0
+        elif left[p] > 0:
+            left[p] -= 1
+            done[p] = way[p]
