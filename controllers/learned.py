@@ -56,11 +56,8 @@ class Policy:
         hold = spec.action.hold
         deep = math.inf if hold is None or hold.inside is None else hold.inside
         self._limits = (0.0 if hold is None else hold.rest, deep)
-        wander = spec.action.wander
-        if hold is not None:
-            self._home_to_hold = HomeHerd(spec.lidar, hold.home)
-        if wander is not None:
-            self._home_to_stay = HomeHerd(spec.lidar, wander.home)
+        homes = {what.home for what in (hold, spec.action.wander) if what is not None}
+        self._herds = {home: HomeHerd(spec.lidar, home) for home in homes}
         self._chance = np.zeros((0, 2))
         self._offset: NDArray[np.int64] | None = None
         self._action: NDArray[np.float64] | None = None
@@ -106,21 +103,20 @@ class Policy:
             self._chance = acting.noise * self._rng.standard_normal((n, 2))
         if self._action is None or state.step % self._interval == 0:
             if self._mirrored is None:
-                self._mirrored = mirror.mirrored(acting.mirror, observation, self._observed)
+                self._mirrored = np.zeros(n, np.bool_)
+                if acting.mirror != "never":  # which needs the goal straight ahead, and sheep
+                    self._mirrored = mirror.mirrored(acting.mirror, observation, self._observed)
             mean, deviation = self._actor(observation, self._mirrored), self._actor.deviation
             chance = self._chance if acting.noise else np.zeros((n, 2))
-            hold = acting.hold
-            if hold is not None and n >= hold.team:
-                outside = self._home_to_hold(frames, self._offset) - hold.ring
-            else:
-                outside = np.full(n, np.nan)
+            hold, wander = acting.hold, acting.wander
+            away = {home: herd(frames, self._offset) for home, herd in self._herds.items()}
+            outside = away[hold.home] - hold.ring if hold is not None and n >= hold.team else np.full(n, np.nan)
             self._action = _wanted(
                 mean, chance, deviation, self._mirrored, self._offset, self._directions, acting.rest, outside,
                 self._limits,
             )  # fmt: skip
-            if self._wanderer is not None:
-                home = np.isfinite(self._home_to_stay(frames, self._offset))
-                self._action = self._wanderer(self._action, home)
+            if self._wanderer is not None and wander is not None:
+                self._action = self._wanderer(self._action, np.isfinite(away[wander.home]))
         return self._action.copy()
 
     def to_dict(self) -> dict[str, Any]:

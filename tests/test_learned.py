@@ -676,3 +676,9 @@ def test_a_shipped_policy_brings_the_sheep_home(name, scenario):
     """A whole episode on a validation seed."""
     (row,) = evaluate(POLICIES[name](), partial(ShepherdingEnv, SCENARIOS[scenario]), [trial_seed(10_000, 0)])
     assert row["in_goal_end"] >= 95.0
+
+
+def test_a_policy_that_sees_no_sheep_acts():
+    lidar = Lidar(beams=16, channels=("shepherds", "goal"), stack=1)
+    policy = Policy(spec_of(lidar), random_weights(SMALL, lidar))
+    assert policy.act(np.zeros((2, 2, 16), np.float32), STATE).shape == (2, 2)
