@@ -38,8 +38,8 @@ def figure1_page(curves: Sequence[Row], validations: Sequence[Row], home: Sequen
         "",
         "Made by `shepherd-phys reproduce`. Of each scheme, over its seeds: the mean reward of training episodes over "
         f"the last {WINDOW} evaluations (rollouts); where the curve levels off [M shepherd-steps], if not only in the "
-        "last tenth of its length; sheep in the goal at the end of the last validation's episodes, %; shepherd-steps a "
-        "second and wall-clock time of training, validations left out.",
+        "last tenth of its length; sheep in the goal at the end of the last validation's episodes, %, mean (least to "
+        "most of the seeds); shepherd-steps a second and wall-clock time of training, validations left out.",
         "",
         "The runs whose time to home is told below were trained one at a time, with all worker processes; rate and "
         "time of `fast` with `wild` are of these alone. All the others had one process each, as many of them at a "
@@ -66,7 +66,7 @@ def figure1_page(curves: Sequence[Row], validations: Sequence[Row], home: Sequen
                     str(len(curve.seeds)),
                     _number(final_value(curve), ".2f"),
                     _levels_off(off, lasts),
-                    *(_number(_mean(at_end.get(k, [])), ".1f") for k in flocks),
+                    *(_spread(at_end.get(k, [])) for k in flocks),
                     *pace,
                 ]
             )
