@@ -59,6 +59,7 @@ class Policy:
         homes = {what.home for what in (hold, spec.action.wander) if what is not None}
         self._herds = {home: HomeHerd(spec.lidar, home) for home in homes}
         self._chance = np.zeros((0, 2))
+        self._deviation = self._actor.deviation if spec.action.noise else np.zeros(2, np.float32)
         self._offset: NDArray[np.int64] | None = None
         self._action: NDArray[np.float64] | None = None
         self._mirrored: NDArray[np.bool_] | None = None
@@ -94,7 +95,7 @@ class Policy:
         if n == 0:
             return np.zeros((0, 2))
         if self._offset is None:
-            self._offset = np.zeros(n, np.int64)
+            self._offset, self._chance = np.zeros(n, np.int64), np.zeros((n, 2))
         acting = self.spec.action
         frames = observation.reshape(n, *self._frames) if self._rolls else observation
         if self._rolls:
@@ -106,14 +107,13 @@ class Policy:
                 self._mirrored = np.zeros(n, np.bool_)
                 if acting.mirror != "never":  # which needs the goal straight ahead, and sheep
                     self._mirrored = mirror.mirrored(acting.mirror, observation, self._observed)
-            mean, deviation = self._actor(observation, self._mirrored), self._actor.deviation
-            chance = self._chance if acting.noise else np.zeros((n, 2))
+            mean = self._actor(observation, self._mirrored)
             hold, wander = acting.hold, acting.wander
             away = {home: herd(frames, self._offset) for home, herd in self._herds.items()}
             outside = away[hold.home] - hold.ring if hold is not None and n >= hold.team else np.full(n, np.nan)
             self._action = _wanted(
-                mean, chance, deviation, self._mirrored, self._offset, self._directions, acting.rest, outside,
-                self._limits,
+                mean, self._chance, self._deviation, self._mirrored, self._offset, self._directions, acting.rest,
+                outside, self._limits,
             )  # fmt: skip
             if self._wanderer is not None and wander is not None:
                 self._action = self._wanderer(self._action, np.isfinite(away[wander.home]))

@@ -682,3 +682,13 @@ def test_a_policy_that_sees_no_sheep_acts():
     lidar = Lidar(beams=16, channels=("shepherds", "goal"), stack=1)
     policy = Policy(spec_of(lidar), random_weights(SMALL, lidar))
     assert policy.act(np.zeros((2, 2, 16), np.float32), STATE).shape == (2, 2)
+
+
+def test_without_chance_how_much_of_it_was_learned_does_not_matter():
+    lidar = Lidar(beams=16, stack=1)
+    weights = random_weights(SMALL, lidar)
+    seen = np.random.default_rng(1).random((5, 3, 16), dtype=np.float32)
+    usual = Policy(spec_of(lidar), weights).act(seen, STATE)
+    weights["log_std"][:] = 1000.0
+    with np.errstate(over="ignore"):
+        np.testing.assert_array_equal(Policy(spec_of(lidar), weights).act(seen, STATE), usual)
