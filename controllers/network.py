@@ -183,7 +183,7 @@ def _forward(observation, mirrored, group, overlap, w1, b1, w2, b2, w3, b3, w4, 
         for r in range(rows):
             seen = observation[p, r]
             for c in range(columns):
-                x = seen[(columns - c) % columns] if mirrored[p] else seen[c]
+                x = seen[columns - c if mirrored[p] and c > 0 else c]
                 if x != 0.0:
                     for near in range(c // group - reach, c // group + reach + 1):
                         k = c - near * group + overlap
