@@ -138,13 +138,16 @@ class Actor:
 
     def __init__(self, network: SectorNetwork, lidar: Lidar, weights: Weights) -> None:
         self._shape = input_shape(lidar)
-        self._group, self._overlap = network.group, network.overlap
-        # a layer's weights input by input: what an input of 0 would read is not read at all
-        self._layers = [
-            array
-            for name in ("groups", "hidden", "latent", "action")
-            for array in (np.array(weights[f"{name}.weight"].T, order="C"), np.array(weights[f"{name}.bias"]))
-        ]
+        self._sizes = (network.group, network.overlap, network.features, network.hidden, network.latent)
+        # a layer's weights input by input: what an input of 0 would read is not read at all; and all in one array: to
+        # give compiled code an array costs time
+        self._weights = np.concatenate(
+            [
+                array.ravel()
+                for name in ("groups", "hidden", "latent", "action")
+                for array in (weights[f"{name}.weight"].T, weights[f"{name}.bias"])
+            ]
+        )
         self.deviation = np.exp(weights["log_std"])
         """(2,) standard deviations of every action."""
 
@@ -160,22 +163,24 @@ class Actor:
             )
         if mirrored is None:
             mirrored = np.zeros(len(observation), np.bool_)
-        means: Means = _forward(
-            np.ascontiguousarray(observation, np.float32), mirrored, self._group, self._overlap, *self._layers
-        )
+        means: Means = _forward(np.ascontiguousarray(observation, np.float32), mirrored, self._sizes, self._weights)
         return means
 
 
 @njit(cache=True, error_model="numpy")
-def _forward(observation, mirrored, group, overlap, w1, b1, w2, b2, w3, b3, w4, b4):  # type: ignore[no-untyped-def]
-    """As `SectorNetwork` says, weights input by input: (inputs, outputs).
+def _forward(observation, mirrored, sizes, numbers):  # type: ignore[no-untyped-def]
+    """As `SectorNetwork` says; ``numbers`` are the weights of each layer, input by input, and its bias.
 
     Most of what a lidar observes is 0, and so is half of what a relu gives: both are skipped. Rows of arrays are taken
     out of the loops over their numbers, which makes these twice as fast.
     """
     n, rows, columns = observation.shape
-    groups, features = columns // group, len(b1)
-    width = group + 2 * overlap
+    group, overlap, features, n_hidden, n_latent = sizes
+    groups, width = columns // group, group + 2 * overlap
+    w1, b1, numbers = _taken(numbers, rows * width, features)
+    w2, b2, numbers = _taken(numbers, groups * features, n_hidden)
+    w3, b3, numbers = _taken(numbers, n_hidden, n_latent)
+    w4, b4, _ = _taken(numbers, n_latent, 2)
     reach = (overlap + group - 1) // group
     shared = np.empty((n, groups, features), np.float32)
     shared[:] = b1
@@ -200,6 +205,13 @@ def _forward(observation, mirrored, group, overlap, w1, b1, w2, b2, w3, b3, w4, 
             y += z * w4[j, 1]
         action[p, 0], action[p, 1] = x, y
     return action
+
+
+@njit(cache=True, error_model="numpy")
+def _taken(numbers, inputs, outputs):  # type: ignore[no-untyped-def]
+    """The weights (inputs, outputs) and the bias (outputs,) of a layer, and the numbers of those after it."""
+    n = inputs * outputs
+    return numbers[:n].reshape(inputs, outputs), numbers[n : n + outputs], numbers[n + outputs :]
 
 
 @njit(cache=True, error_model="numpy")

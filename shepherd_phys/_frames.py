@@ -79,6 +79,13 @@ def rolled_sectors(rows: Any, offsets: Ints, out: Any) -> None:
 
 
 @njit(cache=True, error_model="numpy")
+def goal_sectors(rows: Any, row: int, directions: Floats, offsets: Ints, out: Any) -> None:
+    """Overwrite ``offsets`` as `goal_offsets` does and roll by them as `rolled_sectors` does: one call costs less."""
+    goal_offsets(rows, row, directions, offsets)
+    rolled_sectors(rows, offsets, out)
+
+
+@njit(cache=True, error_model="numpy")
 def _copy(line: Any, out: Any) -> None:
     """Write ``line`` to where ``out`` begins."""
     for k in range(len(line)):

@@ -59,7 +59,10 @@ class Stack:
 
     def offset(self, last: NDArray[np.int64]) -> NDArray[np.int64]:
         """The beam offsets (P,) that `observe` would answer, in the goal frame, without an observation."""
-        return _goal_offsets(self._frames[-1], 0, last, self._lidar)
+        offsets, lidar = last.copy(), self._lidar
+        goal = lidar.channels.index("goal")
+        _frames.goal_offsets(self._frames[-1], goal, beam_directions(lidar.beams), offsets)
+        return offsets
 
     def observe(self, offset: NDArray[np.int64]) -> tuple[Proximities, NDArray[np.int64]]:
         """`observe` of the frames, without its copy."""
@@ -97,27 +100,18 @@ def _observe(stack: Proximities, offset: NDArray[np.int64], lidar: Lidar) -> tup
     rows: Any = stack
     if lidar.frame == "goal" or columns != beams:
         rows = stack.reshape(-1, n_frames * n_channels, beams)
-        offset = np.ascontiguousarray(offset)
-        if lidar.frame == "goal":
-            newest = (n_frames - 1) * n_channels
-            offset = _goal_offsets(rows, newest, offset.reshape(-1), lidar).reshape(offset.shape)
-            turns = offset.reshape(-1)
-        else:
-            turns = np.zeros(len(rows), np.int64)
         grouped = np.empty((*rows.shape[:2], columns), np.float32)
-        _frames.rolled_sectors(rows, turns, grouped)
+        if lidar.frame == "goal":
+            offset = offset.copy()
+            goal = (n_frames - 1) * n_channels + lidar.channels.index("goal")
+            _frames.goal_sectors(rows, goal, beam_directions(beams), offset.reshape(-1), grouped)
+        else:
+            _frames.rolled_sectors(rows, np.zeros(len(rows), np.int64), grouped)
         rows = grouped
     if lidar.layout == "paper":
         framed = rows.reshape(*teams, n_frames, n_channels * columns)
         return np.ascontiguousarray(np.moveaxis(framed, -2, -1))[..., None, :], offset
     return rows.reshape(*teams, n_frames * n_channels, columns), offset
-
-
-def _goal_offsets(rows: Proximities, first: int, last: NDArray[np.int64], lidar: Lidar) -> NDArray[np.int64]:
-    """The beam offsets (P,) after a frame: the channels in ``rows`` (P, R, beams) from the ``first`` one on."""
-    offsets = last.copy()
-    _frames.goal_offsets(rows, first + lidar.channels.index("goal"), beam_directions(lidar.beams), offsets)
-    return offsets
 
 
 def turn(action: NDArray[Any], offset: NDArray[np.int64], beams: int) -> NDArray[Any]:

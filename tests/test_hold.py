@@ -191,6 +191,7 @@ def test_nobody_can_stand_further_inside_a_ring_than_its_centre():
         Hold(ring=9.0, inside=20.0)
 
 
-@pytest.mark.parametrize("name", ["collie", "collie-obstacles"])
+@pytest.mark.parametrize("name", POLICIES)
 def test_shipped_policies_act_as_their_presets_say(name):
-    assert POLICIES[name]().spec.action == load_preset(name).acting()
+    preset = load_preset("fast" if name in ("wild", "any", "original") else name)
+    assert POLICIES[name]().spec.action == preset.acting()
