@@ -19,6 +19,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from shepherd_phys.layouts import Scattered
 from shepherd_phys.learning.folder import BEST, CURVE, POLICY, PRESET, VALIDATION, agree, begin
 from shepherd_phys.learning.preset import PRESETS, Preset, load_preset
+from shepherd_phys.learning.validation import scenarios
 from shepherd_phys.settings import SettingsError, kind_of
 from shepherd_phys.world import World
 
@@ -161,7 +162,7 @@ def prepare(options: Train, given: set[str], kinds: Mapping[str, Any]) -> tuple[
     preset.start()
     # is there room for all obstacles, was everything of a user's own handed over, does any of it fail
     seeds = range(preset.validation.seed, preset.validation.seed + TRIED)
-    for scenario in preset.extremes():
+    for scenario in (*preset.extremes(), *scenarios(preset)):
         try_out(World(scenario), seeds, preset.scheme(), preset.lidar)
     begin(folder, preset)
     return folder, preset

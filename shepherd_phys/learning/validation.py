@@ -51,14 +51,9 @@ class Validator:
     def __init__(self, preset: Preset, workers: Workers | None = None) -> None:
         self._settings = preset.validation
         self._workers = workers
-        self.points = [
-            {"n_flocks": n_flocks, "cohesion": cohesion, "n_shepherds": n_shepherds}
-            for n_flocks in self._settings.flocks
-            for cohesion in (self._settings.cohesion if hasattr(preset.scenario.flock, "n_neighbours") else (None,))
-            for n_shepherds in self._settings.shepherds
-        ]
-        """What the worlds are, in order; ``cohesion`` is None where the flock model has no n."""
-        self._scenarios = [_scenario(preset.scenario, point) for point in self.points]
+        self.points = points(preset)
+        """What the worlds are, in order."""
+        self._scenarios = scenarios(preset)
         self._seeds = [trial_seed(self._settings.seed, trial) for trial in range(self._settings.trials)]
 
     def __call__(self, policy: Policy) -> list[dict[str, Any]]:
@@ -112,6 +107,26 @@ def validator(preset: Preset, n_workers: int) -> Iterator[Validator]:
         return
     with Workers(episode, n_workers, TIMEOUT) as workers:
         yield Validator(preset, workers)
+
+
+def points(preset: Preset) -> list[dict[str, Any]]:
+    """What the worlds of a preset's validation are, in order; ``cohesion`` is None where the flock model has no n."""
+    asked = preset.validation
+    return [
+        {"n_flocks": n_flocks, "cohesion": cohesion, "n_shepherds": n_shepherds}
+        for n_flocks in asked.flocks
+        for cohesion in (asked.cohesion if hasattr(preset.scenario.flock, "n_neighbours") else (None,))
+        for n_shepherds in asked.shepherds
+    ]
+
+
+def scenarios(preset: Preset) -> list[Scenario]:
+    """The scenarios of a preset's `points`.
+
+    Raises:
+        SettingsError: a point cannot be.
+    """
+    return [_scenario(preset.scenario, point) for point in points(preset)]
 
 
 def _scenario(base: Scenario, point: Mapping[str, Any]) -> Scenario:
