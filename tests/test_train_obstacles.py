@@ -68,7 +68,7 @@ def test_a_body_that_is_asked_for_is_that_of_every_episode():
         ('[scenario]\nshepherds = [{kind = "mine:Tank"}]\n', "mine:Tank"),  # not handed over
         ('scenarios = ["scattered"]\ndensity = [0.0, 0.45]\n', "density: 0.45 is impossible"),  # no room for the most
         # room where it learns, and none where it is validated
-        ('density = [0.0, 0.01]\n[scenario.layout]\nkind = "Scattered"\ndensity = 0.45\n', "density: 0.45 is impossible"),
+        ('density = [0.0, 0.01]\n[scenario.layout]\nkind = "Scattered"\ndensity = 0.45\n', "0.45 is impossible"),
     ],
 )
 def test_a_preset_that_cannot_be_leaves_no_folder(text, message, tmp_path, capsys):
