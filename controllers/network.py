@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from numba import njit
@@ -79,11 +78,6 @@ class SectorNetwork(Settings):
 
 ARCHITECTURES: dict[str, type[SectorNetwork]] = {"SectorNetwork": SectorNetwork}
 """By name, for policy files."""
-
-
-def without_scatter(table: Mapping[str, Any]) -> dict[str, Any]:
-    """A network's fields without ``scatter``: the policies and runs of earlier versions say that it is false."""
-    return {name: value for name, value in table.items() if name != "scatter" or value is not False}
 
 
 def bytes_of(shapes: Mapping[str, tuple[int, ...]]) -> int:

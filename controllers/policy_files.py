@@ -29,7 +29,7 @@ from shepherd_phys.scenario import Scenario
 from shepherd_phys.settings import Settings, SettingsError, settings, tagged, untagged
 
 from .hold import Hold, check_sight
-from .network import ARCHITECTURES, SectorNetwork, bytes_of, without_scatter
+from .network import ARCHITECTURES, SectorNetwork, bytes_of
 from .wander import Wander
 
 FORMAT = "shepherd_phys policy"
@@ -208,7 +208,7 @@ def _spec(table: Mapping[str, Any], classes: Iterable[Any]) -> PolicySpec:
 
 
 def _network(table: Mapping[str, Any]) -> SectorNetwork:
-    network = untagged(without_scatter(table), ARCHITECTURES, "network")
+    network = untagged(table, ARCHITECTURES, "network")
     if not isinstance(network, SectorNetwork):  # module:Name
         raise PolicyError(f"network.kind: {_brief(repr(table['kind']))} is unknown; known: {', '.join(ARCHITECTURES)}")
     return network

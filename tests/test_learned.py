@@ -488,14 +488,6 @@ def test_hostile_fields_are_one_error(name, policy_path):
     refused(policy_path)
 
 
-def test_policies_of_earlier_versions_are_read(policy_path):
-    """They say that actions do not scatter by what is seen."""
-    table = json.loads(policy_path.read_text())
-    table["network"]["scatter"] = False
-    resealed(policy_path, table)
-    assert load_policy(policy_path).spec == spec_of()
-
-
 @pytest.mark.parametrize("name", FIELDS)
 def test_a_missing_field_is_one_error(name, policy_path):
     table = json.loads(policy_path.read_text())

@@ -394,9 +394,6 @@ def test_presets_are_read_and_written(tmp_path):
     TINY.to_toml(tmp_path / "p.toml")
     assert load_preset(tmp_path / "p.toml") == TINY
     assert load_preset("fast").but(budget=1) == Preset(budget=1, wander=Wander())
-    text = (tmp_path / "p.toml").read_text()
-    (tmp_path / "p.toml").write_text(text.replace("[network]\n", "[network]\nscatter = false\n"))  # earlier versions
-    assert "scatter" in (tmp_path / "p.toml").read_text() and load_preset(tmp_path / "p.toml") == TINY
 
 
 def test_the_papers_preset_is_the_papers():

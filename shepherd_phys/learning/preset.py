@@ -11,14 +11,7 @@ from pydantic import BeforeValidator, Field
 
 from shepherd_phys.controllers.hold import Hold
 from shepherd_phys.controllers.learned import POLICIES, load_policy
-from shepherd_phys.controllers.network import (
-    SectorNetwork,
-    Weights,
-    bytes_of,
-    input_shape,
-    with_channels,
-    without_scatter,
-)
+from shepherd_phys.controllers.network import SectorNetwork, Weights, bytes_of, input_shape, with_channels
 from shepherd_phys.controllers.policy_files import MAX_FRAMES, MAX_WEIGHTS, Acting
 from shepherd_phys.controllers.wander import Wander
 from shepherd_phys.envs.mixture import Mixture
@@ -351,8 +344,6 @@ class Preset(Settings):
             values["scenario"] = Scenario.from_dict(values["scenario"], classes)
         if isinstance(values.get("lidar"), Mapping):  # by now the scenario has been made
             values["lidar"] = {"channels": _channels(**values), **values["lidar"]}
-        if isinstance(values.get("network"), Mapping):
-            values["network"] = without_scatter(values["network"])
         return cls(**values)
 
     @classmethod
