@@ -19,7 +19,7 @@ from shepherd_phys.state import WorldState
 
 from .hold import HomeHerd
 from .network import Actor
-from .policy_files import PolicySpec, read_policy
+from .policy_files import PolicySpec, checked_weights, read_policy
 from .wander import Wanderer
 
 SHIPPED = Path(__file__).parent / "policies"
@@ -36,13 +36,16 @@ class Policy:
         weights: of its network, float32 by name.
         checksum: identifies it in results.
         name: for results and messages.
+
+    Raises:
+        PolicyError: the weights are not those that the network needs.
     """
 
     def __init__(
         self, spec: PolicySpec, weights: Mapping[str, NDArray[np.float32]], checksum: str = "", name: str = "policy"
     ) -> None:
         self.spec = spec
-        self.weights = dict(weights)
+        self.weights = checked_weights(weights, spec)
         self.checksum = checksum
         self.name = name
         self._actor = Actor(spec.network, spec.lidar, weights)
@@ -90,12 +93,19 @@ class Policy:
         Args:
             observation: (P, stack x channels, beams or sectors) by the settings ``lidar``.
             state: only its clock is read.
+
+        Raises:
+            ValueError: the episode began with a team of another size.
         """
         n = len(observation)
         if n == 0:
             return np.zeros((0, 2))
         if self._offset is None:
             self._offset, self._chance = np.zeros(n, np.int64), np.zeros((n, 2))
+        if len(self._offset) != n:
+            raise ValueError(
+                f"observation: is of {n} shepherds, in an episode that began with {len(self._offset)}; call reset first"
+            )
         acting = self.spec.action
         frames = observation.reshape(n, *self._frames) if self._rolls else observation
         if self._rolls:

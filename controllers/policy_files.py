@@ -10,7 +10,8 @@ import hashlib
 import json
 import math
 import stat
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -126,7 +127,9 @@ def write_policy(path: str | Path, spec: PolicySpec, weights: Mapping[str, NDArr
         PolicyError: they do not fit one another, hold a number that is not finite, or cannot be written.
     """
     path = _checked_path(path)
-    weights = _checked_weights(weights, spec, path)
+    with _told_of(path):
+        weights = checked_weights(weights, spec)
+        _check_size(spec)
     blob = safetensors.numpy.save({name: np.ascontiguousarray(array) for name, array in weights.items()})
     table: dict[str, Any] = {
         "format": FORMAT,
@@ -142,12 +145,14 @@ def write_policy(path: str | Path, spec: PolicySpec, weights: Mapping[str, NDArr
     }
     try:
         table["checksum"] = _checksum(table)
-        text = json.dumps(table, indent=1, allow_nan=False) + "\n"
+        text = (json.dumps(table, indent=1, allow_nan=False) + "\n").encode()
     except (TypeError, ValueError) as error:
         raise PolicyError(f"{path}: what describes the policy must be plain, finite data ({error})") from None
+    if len(text) > MAX_JSON:
+        raise PolicyError(f"{path}: what describes the policy is of {len(text)} bytes; at most {MAX_JSON} are read")
     try:
         # the weights first: a JSON file that is there finds its weights, unless it is replacing an older pair
-        for file, content in ((path.with_suffix(".safetensors"), blob), (path, text.encode())):
+        for file, content in ((path.with_suffix(".safetensors"), blob), (path, text)):
             with whole_file(file) as part:
                 part.write_bytes(content)
     except OSError as error:
@@ -174,17 +179,13 @@ def read_policy(
     table = _parsed(_read(path, MAX_JSON), path)
     try:
         spec = _spec(table, classes)
-        shapes = spec.network.shapes(spec.lidar)
+        spec.network.shapes(spec.lidar)
     except SettingsError as error:
         raise PolicyError(f"{path}: {_brief(str(error))}") from None
     except (TypeError, ValueError, OverflowError, RecursionError) as error:
         raise PolicyError(f"{path}: is not a policy ({_brief(str(error))})") from None
-    size = bytes_of(shapes)
-    if size > MAX_WEIGHTS:
-        raise PolicyError(f"{path}: network: {size} bytes of weights; at most {MAX_WEIGHTS} are read")
-    kept = spec.lidar.remembered
-    if kept > MAX_FRAMES:
-        raise PolicyError(f"{path}: lidar: {kept} numbers of frames to remember a shepherd; at most {MAX_FRAMES}")
+    with _told_of(path):
+        size = _check_size(spec)
     beside = path.with_suffix(".safetensors")
     blob = _read(beside, size + HEADER)
     if hashlib.sha256(blob).hexdigest() != table["weights_sha256"]:
@@ -193,7 +194,8 @@ def read_policy(
         weights = safetensors.numpy.load(blob)
     except (safetensors.SafetensorError, KeyError, TypeError, ValueError) as error:
         raise PolicyError(f"{beside}: is not a safetensors file ({_brief(str(error))})") from None
-    return spec, _checked_weights(weights, spec, beside), str(table["checksum"])
+    with _told_of(beside):
+        return spec, checked_weights(weights, spec), str(table["checksum"])
 
 
 def _spec(table: Mapping[str, Any], classes: Iterable[Any]) -> PolicySpec:
@@ -272,23 +274,50 @@ def _finite(text: str) -> float:
     return number
 
 
-def _checked_weights(
-    weights: Mapping[str, NDArray[np.float32]], spec: PolicySpec, path: Path
-) -> dict[str, NDArray[np.float32]]:
-    """The weights: those that the network needs, each of its shape, float32 and finite."""
+def checked_weights(weights: Mapping[str, NDArray[np.float32]], spec: PolicySpec) -> dict[str, NDArray[np.float32]]:
+    """The weights, if they are those that the network needs, each of its shape, float32 and finite.
+
+    Raises:
+        PolicyError: they are not.
+        SettingsError: the network does not fit the lidar.
+    """
     shapes = spec.network.shapes(spec.lidar)
     for name in weights:
         if name not in shapes:
-            raise PolicyError(f"{path}: unknown weight {_brief(repr(name))}; there are {', '.join(shapes)}")
+            raise PolicyError(f"unknown weight {_brief(repr(name))}; there are {', '.join(shapes)}")
     for name, shape in shapes.items():
         if name not in weights:
-            raise PolicyError(f"{path}: no weight {name!r}; there are {', '.join(shapes)}")
+            raise PolicyError(f"no weight {name!r}; there are {', '.join(shapes)}")
         array = weights[name]
         if array.dtype != np.float32 or array.shape != shape:
-            raise PolicyError(f"{path}: {name}: must be float32 {shape} (given: {array.dtype} {array.shape})")
+            raise PolicyError(f"{name}: must be float32 {shape} (given: {array.dtype} {array.shape})")
         if not np.isfinite(array).all():
-            raise PolicyError(f"{path}: {name}: holds a NaN or an infinity")
+            raise PolicyError(f"{name}: holds a NaN or an infinity")
     return dict(weights)
+
+
+def _check_size(spec: PolicySpec) -> int:
+    """Bytes of the weights.
+
+    Raises:
+        PolicyError: a file with so many, or whose policy would remember so much, is not read.
+    """
+    size = bytes_of(spec.network.shapes(spec.lidar))
+    if size > MAX_WEIGHTS:
+        raise PolicyError(f"network: {size} bytes of weights; at most {MAX_WEIGHTS} are read")
+    kept = spec.lidar.remembered
+    if kept > MAX_FRAMES:
+        raise PolicyError(f"lidar: {kept} numbers of frames to remember a shepherd; at most {MAX_FRAMES}")
+    return size
+
+
+@contextmanager
+def _told_of(path: Path) -> Iterator[None]:
+    """Put the file's name before what is said of what is in it."""
+    try:
+        yield
+    except PolicyError as error:
+        raise PolicyError(f"{path}: {error}") from None
 
 
 def _checked_path(path: str | Path) -> Path:

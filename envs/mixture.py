@@ -6,7 +6,7 @@ import math
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BeforeValidator, Field
+from pydantic import AfterValidator, Field
 
 from shepherd_phys.layouts import Scattered
 from shepherd_phys.lidar import Channel
@@ -14,8 +14,8 @@ from shepherd_phys.scenario import Scenario, with_neighbours
 from shepherd_phys.settings import Settings, settings
 
 
-def _ordered(value: Any) -> Any:
-    if isinstance(value, list | tuple) and len(value) == 2 and value[0] > value[1]:
+def _ordered(value: tuple[Any, Any]) -> tuple[Any, Any]:
+    if value[0] > value[1]:
         raise ValueError("the smaller number comes first")
     return value
 
@@ -30,18 +30,18 @@ class Mixture(Settings):
 
     base: Scenario = Scenario()
     """All that is not drawn here, the range of the flocks' distances among it."""
-    n_flocks: Annotated[tuple[Count, Count], BeforeValidator(_ordered)] = (1, 8)
+    n_flocks: Annotated[tuple[Count, Count], AfterValidator(_ordered)] = (1, 8)
     """Least and most flocks."""
-    n_neighbours: Annotated[tuple[Count, Count], BeforeValidator(_ordered)] | None = (3, 85)
+    n_neighbours: Annotated[tuple[Count, Count], AfterValidator(_ordered)] | None = (3, 85)
     """Least and most neighbours n to whom a sheep is drawn, the paper's cohesion; None: as in the base, whose flock
     model need not have an ``n_neighbours``."""
 
-    n_sheep: Annotated[tuple[Count, Count], BeforeValidator(_ordered)] | None = None
+    n_sheep: Annotated[tuple[Count, Count], AfterValidator(_ordered)] | None = None
     """Least and most sheep, drawn with their logarithm uniform; the goal's area grows and shrinks with their number.
     None: as in the base."""
     others: tuple[Scenario, ...] = ()
     """Each episode's base is the base or one of these, all with the same probability."""
-    density: Annotated[tuple[Fraction, Fraction], BeforeValidator(_ordered)] | None = None
+    density: Annotated[tuple[Fraction, Fraction], AfterValidator(_ordered)] | None = None
     """Least and largest part of the box that obstacles cover where a base's layout is `Scattered`; None: its own."""
     uneven: float = Field(default=0.0, ge=0, le=1)
     """Fraction of the episodes whose flocks differ in size: one sheep each, and the others by shares that are drawn

@@ -234,7 +234,11 @@ class TeamVecEnv(VecEnv):
         """
         if not self._pending:
             raise RuntimeError("no step is under way: call step_async first")
-        endings: dict[int, Ending] = self._crew.answer()
+        try:
+            endings: dict[int, Ending] = self._crew.answer()
+        except Exception:  # some worlds have moved and others not: only a reset goes on from here
+            self._pending = self._started = False
+            raise
         self._pending = False
         done = np.zeros(self.num_envs, dtype=np.bool_)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]

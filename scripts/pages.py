@@ -138,9 +138,9 @@ def part_cells(part: Mapping[str, Any]) -> tuple[str, ...]:
     """A part of a claim as cells under `PART_HEAD`."""
     method = part["method"] if part["rival"] is None else f"{part['method']} - {part['rival']}"
     at = "" if part["n_flocks"] is None else f"flocks: {part['n_flocks']}, n = {part['cohesion']}"
-    if part.get("recipe") is not None:  # what was judged before there were recipes has none
+    if part["recipe"] is not None:
         at = f"recipe {part['recipe']}"
-        if part.get("budget") is not None:
+        if part["budget"] is not None:
             at += f", {part['budget'] / 1e6:.2f} M shepherd-steps"
     digits = ".2f" if 0 in (part["least"], part["most"]) else ".1f"  # a correlation, or percent and metres
     value = part["note"] if part["value"] is None else _interval(part, "value", "", digits)

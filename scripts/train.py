@@ -53,7 +53,8 @@ class Train:
     init: Annotated[str | None, flag("NAME|FILE", "the preset's")] = None
     """Policy to start from: a shipped one's name or a .json file."""
     scenario: Annotated[str | None, flag("NAME|FILE|module:Name", "the preset's")] = None
-    """Scenario, the only one then; where its flocks and obstacles are is its own, and not the preset's."""
+    """Scenario, the only one then; where its flocks and obstacles are is its own, and not the preset's. Sizes of teams
+    and numbers of flocks stay the preset's; so does n where the preset draws it."""
     obstacles: Annotated[int | None, flag("COUNT", "the scenario's")] = None
     """Discs of radius 1 m, drawn anew for each episode: so many."""
     density: Annotated[float | None, flag("FRACTION", "the scenario's")] = None

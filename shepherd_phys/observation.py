@@ -87,10 +87,16 @@ def observe(stack: Proximities, offset: NDArray[np.int64], lidar: Lidar) -> tupl
         the beam offset now (...): observed column 0 points at world beam ``offset``. It stays where no goal beam is
         lit, or more than half of them (then the shepherd stands inside; obstacles so near to the goal that they cut
         half of the way out hide that from it).
+
+    Raises:
+        ValueError: there are not as many offsets as shepherds.
     """
+    offset = np.asarray(offset, np.int64)
+    if offset.shape != stack.shape[:-3]:
+        raise ValueError(f"offset: needs the shape {stack.shape[:-3]}, has {offset.shape}")
     rolled = lidar.frame == "goal" or (lidar.sectors or lidar.beams) != lidar.beams  # then it is fresh anyway
     frames = np.ascontiguousarray(stack, np.float32) if rolled else np.array(stack, np.float32)
-    return _observe(frames, np.asarray(offset, np.int64), lidar)
+    return _observe(frames, offset, lidar)
 
 
 def _observe(stack: Proximities, offset: NDArray[np.int64], lidar: Lidar) -> tuple[Proximities, NDArray[np.int64]]:

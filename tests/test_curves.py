@@ -196,8 +196,6 @@ def test_the_papers_recipe_is_judged_beside():
     )
     late = part_cells(c8(study([10] * 3, [38] * 3)).parts[0].to_dict())
     assert late[2:] == ("any does not level off", "> 0", "undecided")
-    first = {name: value for name, value in claim.parts[0].to_dict().items() if name != "budget"}
-    assert part_cells(first)[1:3] == ("recipe fast", "10.00 [10.00, 10.00]")  # as earlier versions wrote it
 
 
 def test_the_interval_is_of_seeds_resampled_apart():

@@ -592,10 +592,17 @@ def test_what_cannot_be_read_is_not_written(tmp_path):
     for wrong in bad.values():
         with pytest.raises(PolicyError):
             write_policy(tmp_path / "p.json", spec_of(), wrong)
-    for training in ({"loss": math.nan}, {"policy": object()}):
+    for training, message in (
+        ({"loss": math.nan}, "plain, finite data"),
+        ({"policy": object()}, "plain, finite data"),
+        ({"diary": "x" * MAX_JSON}, "at most 1048576 are read"),
+    ):
         spec = PolicySpec(SCENARIOS["small"], LIDAR, SMALL, Acting(frame="goal"), {}, training)
-        with pytest.raises(PolicyError, match="plain, finite data"):
+        with pytest.raises(PolicyError, match=message):
             write_policy(tmp_path / "p.json", spec, weights)
+    huge = SectorNetwork(hidden=4096, latent=4096)
+    with pytest.raises(PolicyError, match="bytes of weights; at most 67108864 are read"):
+        write_policy(tmp_path / "p.json", spec_of(network=huge), random_weights(huge, LIDAR))
     with pytest.raises(PolicyError, match="cannot be written"):
         write_policy(tmp_path / "no" / "p.json", spec_of(), weights)
     with pytest.raises(PolicyError, match="named by its .json file"):
@@ -614,6 +621,30 @@ def refused(path):
     assert message.isprintable() and len(message) < 800, message
     assert "p.json" in message or "p.safetensors" in message
     assert sorted(os.listdir(path.parent)) == before
+
+
+@pytest.mark.parametrize("network", [SMALL.but(hidden=6), SMALL.but(latent=9), SMALL.but(features=4)])
+def test_weights_of_another_network_are_refused(network):
+    with pytest.raises(PolicyError, match=r"must be float32 \("):
+        Policy(spec_of(network=network), random_weights(SMALL, LIDAR))
+
+
+@pytest.mark.parametrize("n", [2, 4])
+def test_a_team_of_another_size_needs_a_reset(n):
+    policy = Policy(spec_of(noise=0.3), random_weights(SMALL, LIDAR))
+    world = World(SCENARIOS["small"])
+    state = world.reset(1)
+    policy.act(np.zeros(policy.lidar.observation_shape(3), np.float32), state)
+    other = np.zeros(policy.lidar.observation_shape(n), np.float32)
+    with pytest.raises(ValueError, match=f"is of {n} shepherds, in an episode that began with 3; call reset first"):
+        policy.act(other, state)
+    policy.reset(np.random.default_rng(0))
+    assert policy.act(other, state).shape == (n, 2)
+
+
+def test_observing_needs_an_offset_for_each_shepherd():
+    with pytest.raises(ValueError, match=r"offset: needs the shape \(6,\), has \(3,\)"):
+        observe(np.zeros((6, 2, 3, 64), np.float32), np.zeros(3, np.int64), LIDAR)
 
 
 def test_observations_of_another_shape_are_refused():

@@ -2,7 +2,6 @@
 
 import ast
 import csv
-import json
 import os
 import shutil
 import subprocess
@@ -306,17 +305,6 @@ def test_a_run_that_is_made_longer_is_the_one_that_was_longer_from_the_start(sho
     assert sorted(os.listdir(tmp_path / "short")) == sorted(os.listdir(tmp_path / "long"))
 
 
-def test_an_end_within_an_interval_is_gone_back_from(unbroken, tmp_path):
-    """As runs of earlier versions left it."""
-    begin(tmp_path, PRESET.but(budget=480))
-    train(tmp_path)
-    end = checkpoints.load_latest(tmp_path / "checkpoints")
-    odd = Checkpoint(2, {**end.arrays, "returns/moments": np.ones(3)}, {**end.facts, "rollouts": 3})
-    checkpoints.save(tmp_path / "checkpoints", odd)
-    train(tmp_path, preset=PRESET)
-    assert_same_run(tmp_path, unbroken)
-
-
 def test_a_run_whose_way_back_is_gone_is_not_made_longer(tmp_path):
     preset = PRESET.but(budget=480, validation=PRESET.validation.but(every=9))
     begin(tmp_path, preset)
@@ -512,8 +500,6 @@ def test_a_folder_holds_one_run(unbroken):
 
 # --------------------------------------------------------------- checkpoints
 
-OLD_CHECKSUM = "e427344320e76a1b8e08b0f5ac22137c410f7687f150ac8c5f3db735ee2e80b5"
-"""Of the arrays, as an earlier version made it."""
 ARRAYS = {"a": np.arange(6, dtype=np.float32).reshape(2, 3), "b": np.array(1.5), "c": np.zeros((2, 3)).T}
 
 
@@ -548,20 +534,6 @@ def test_what_a_checkpoint_tells_beside_its_arrays_is_checked_too(tmp_path):
         path.write_bytes(whole.replace(right, wrong))
         with pytest.raises(CheckpointError, match="is damaged"):
             checkpoints.load(path)
-
-
-def test_checkpoints_of_earlier_versions_are_read(tmp_path):
-    """Their checksum is of the arrays alone."""
-    path = checkpoints.save(tmp_path, Checkpoint(7, ARRAYS, {}))
-    arrays = checkpoints.load(path).arrays
-    table = {"number": 7, "facts": {"rollouts": 140}, "sha256": OLD_CHECKSUM}
-    safetensors.numpy.save_file(dict(arrays), path, metadata={"checkpoint": json.dumps(table)})
-    read = checkpoints.load_latest(tmp_path)
-    assert (read.number, read.facts) == (7, {"rollouts": 140})
-    table["sha256"] = OLD_CHECKSUM[::-1]
-    safetensors.numpy.save_file(dict(arrays), path, metadata={"checkpoint": json.dumps(table)})
-    with pytest.raises(CheckpointError, match="is damaged"):
-        checkpoints.load(path)
 
 
 def test_files_that_are_no_checkpoints_are_left_alone(tmp_path):

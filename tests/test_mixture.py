@@ -27,6 +27,8 @@ def test_mixture_draws_within_its_ranges_and_from_its_stream():
         Mixture(base=SMALL.but(flock_sizes=(1, 5)), n_flocks=(1, 2))
     with pytest.raises(SettingsError, match="the smaller number comes first"):
         Mixture(n_flocks=(3, 1))
+    with pytest.raises(SettingsError, match=r"n_flocks.*integer.*given: 'a'"):
+        Mixture(n_flocks=(1, "a"))
 
 
 def test_flocks_of_a_mixture_may_differ_in_size():

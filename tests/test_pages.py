@@ -189,6 +189,6 @@ def test_the_guide_shows_what_is_committed():
     committed = {path.name for path in REPRODUCTION.glob("*")}
     assert {name for name in FILES if f"](reproduction/{name})" in page} == committed & set(LINKED)
     assert committed <= {*FILES, "training"}
-    policies = {f"{which}.{kind}" for which in ("first", "policy") for kind in ("json", "safetensors")}
+    policies = {f"{which}.{kind}" for which in ("first", "start") for kind in ("json", "safetensors")}
     kept = {"preset.toml", "curve.csv", "validation.csv", *policies}
     assert {path.name for path in REPRODUCTION.glob("training/*/*")} <= kept

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from team_scenes import SMALL, Constant, alternating, episode_seeds, no_scenario, view
+from team_scenes import SMALL, Constant, Fails, alternating, episode_seeds, no_scenario, view
 
 pytest.importorskip("stable_baselines3")
 
@@ -494,6 +494,18 @@ def test_ppo_trains_on_it_without_a_warning(n_workers, seen):
 def test_bad_arguments(arguments, message):
     with pytest.raises(SettingsError, match=message):
         TeamVecEnv(**{"scenario": SMALL, **arguments})
+
+
+def test_a_step_that_failed_is_not_made_twice():
+    env = TeamVecEnv(SMALL, (1, 1), lidar=COMPACT, rewards={"fails": (1.0, Fails(1))})
+    env.reset()
+    with pytest.raises(ValueError, match="the wolf"):
+        env.step(np.zeros((2, 2)))
+    for call in (env.step_wait, lambda: env.step(np.zeros((2, 2)))):
+        with pytest.raises(RuntimeError, match="call"):
+            call()
+    env.reset()
+    assert env.get_attr("decisions") == [0, 0]
 
 
 def test_bad_actions_and_calls_out_of_turn():

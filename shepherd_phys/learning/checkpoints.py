@@ -96,14 +96,12 @@ def load(path: Path) -> Checkpoint:
             table = json.loads((file.metadata() or {})["checkpoint"])
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (it is no mapping)
         number, facts = int(table["number"]), dict(table["facts"])
-        # what was written before there was a checksum of everything has one of the arrays alone
-        whole = {"number": table["number"], "facts": facts} if "checksum" in table else None
-        digest = table["sha256"] if whole is None else table["checksum"]
+        digest = table.pop("checksum")
     except OSError as error:
         raise CheckpointError(f"{path}: cannot be read ({error})") from None
     except (safetensors.SafetensorError, KeyError, TypeError, ValueError) as error:
         raise CheckpointError(f"{path}: is not a checkpoint ({' '.join(str(error).split())})") from None
-    if digest != _checksum(arrays, whole):
+    if digest != _checksum(arrays, table):
         raise CheckpointError(f"{path}: is damaged (its checksum is wrong)")
     return Checkpoint(number, arrays, facts)
 
@@ -115,11 +113,9 @@ def _numbered(folder: Path) -> list[tuple[int, Path]]:
     return sorted((int(match[1]), path) for path in folder.iterdir() if (match := NAME.fullmatch(path.name)))
 
 
-def _checksum(arrays: Mapping[str, Array], table: Mapping[str, Any] | None) -> str:
-    """SHA-256 of the arrays and, where it is given, of what is told beside them."""
-    total = hashlib.sha256()
-    if table is not None:
-        total.update(f"{json.dumps(table, sort_keys=True)}\n".encode())
+def _checksum(arrays: Mapping[str, Array], table: Mapping[str, Any]) -> str:
+    """SHA-256 of the arrays and of what is told beside them."""
+    total = hashlib.sha256(f"{json.dumps(table, sort_keys=True)}\n".encode())
     for name in sorted(arrays):
         total.update(f"{name} {arrays[name].dtype} {arrays[name].shape}\n".encode())
         total.update(np.ascontiguousarray(arrays[name]).tobytes())

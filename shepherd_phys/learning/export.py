@@ -81,11 +81,6 @@ def to_policy(model: BaseAlgorithm | TeamPolicy, spec: PolicySpec, path: str | P
     if not isinstance(policy, TeamPolicy):
         raise PolicyError(f"only a TeamPolicy can become a policy file (given: {type(policy).__name__})")
     weights = actor_weights(policy)
-    shapes = spec.network.shapes(spec.lidar)
-    _check_names(shapes, weights)
-    for name, shape in shapes.items():
-        if weights[name].shape != shape:
-            raise PolicyError(f"{name}: the spec tells {shape}, the model has {weights[name].shape}")
     checksum = write_policy(path, spec, weights) if path is not None else ""
     return Policy(spec, weights, checksum, Path(path).stem if path is not None else "policy")
 

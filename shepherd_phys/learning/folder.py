@@ -90,10 +90,10 @@ def start_of(folder: Path, preset: Preset) -> Weights | None:
     """Weights that the run in a folder began with; None where its preset names no policy to start from.
 
     Raises:
-        SettingsError: they cannot be read; or, of a run that did not keep them, the policy cannot be had.
+        SettingsError: they cannot be read.
     """
-    if preset.init is None or not (folder / START).exists():  # runs of earlier versions did not keep them
-        return preset.start()
+    if preset.init is None:
+        return None
     try:
         return safetensors.numpy.load((folder / START).read_bytes())
     except (OSError, safetensors.SafetensorError) as error:
@@ -154,9 +154,7 @@ def check_settings(saved: Checkpoint, preset: Preset, path: Path, classes: Itera
     Raises:
         SettingsError: it was changed; the message names the fields.
     """
-    then = saved.facts.get(SETTINGS)
-    if then is None:  # earlier versions did not tell
-        return
+    then = saved.facts[SETTINGS]
     with suppress(SettingsError):  # what an earlier version did not know has its default
         then = settings_of(Preset.from_dict(then, classes))
     apart = list(_differences(then, settings_of(preset)))

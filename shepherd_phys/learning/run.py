@@ -164,9 +164,7 @@ def _gone_on_from(newest: Checkpoint, preset: Preset, folder: Path) -> Checkpoin
 
 def _in_turn(saved: Checkpoint, preset: Preset) -> bool:
     """Whether a checkpoint is what it would be in a longer run, too."""
-    # what was written before runs ended with whole intervals may lie within one
-    whole = saved.facts["rollouts"] == saved.number * preset.checkpoint_rollouts
-    return bool(whole and not saved.facts.get("out_of_turn", False))
+    return not saved.facts.get("out_of_turn", False)
 
 
 def _forget(folder: Path, newest: Checkpoint, saved: Checkpoint | None) -> None:
