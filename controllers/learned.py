@@ -62,6 +62,7 @@ class Policy:
         homes = {what.home for what in (hold, spec.action.wander) if what is not None}
         self._herds = {home: HomeHerd(spec.lidar, home) for home in homes}
         self._chance = np.zeros((0, 2))
+        self._outside = np.zeros(0)
         self._deviation = self._actor.deviation if spec.action.noise else np.zeros(2, np.float32)
         self._offset: NDArray[np.int64] | None = None
         self._action: NDArray[np.float64] | None = None
@@ -102,6 +103,7 @@ class Policy:
             return np.zeros((0, 2))
         if self._offset is None:
             self._offset, self._chance = np.zeros(n, np.int64), np.zeros((n, 2))
+            self._outside = np.full(n, np.nan)
         if len(self._offset) != n:
             raise ValueError(
                 f"observation: is of {n} shepherds, in an episode that began with {len(self._offset)}; call reset first"
@@ -120,10 +122,11 @@ class Policy:
             mean = self._actor(observation, self._mirrored)
             hold, wander = acting.hold, acting.wander
             away = {home: herd(frames, self._offset) for home, herd in self._herds.items()}
-            outside = away[hold.home] - hold.ring if hold is not None and n >= hold.team else np.full(n, np.nan)
-            self._action = _wanted(
+            outside = away[hold.home] - hold.ring if hold is not None and n >= hold.team else self._outside
+            self._action = np.empty((n, 2))
+            _wanted(
                 mean, self._chance, self._deviation, self._mirrored, self._offset, self._directions, acting.rest,
-                outside, self._limits,
+                outside, self._limits, self._action,
             )  # fmt: skip
             if self._wanderer is not None and wander is not None:
                 self._action = self._wanderer(self._action, np.isfinite(away[wander.home]))
@@ -135,8 +138,8 @@ class Policy:
 
 
 @njit(cache=True, error_model="numpy")
-def _wanted(mean, chance, deviation, mirrored, offset, directions, rest, outside, limits):  # type: ignore[no-untyped-def]
-    """Actions (P, 2) of a network as the world takes them: everything in one call, which costs less than its parts.
+def _wanted(mean, chance, deviation, mirrored, offset, directions, rest, outside, limits, wanted):  # type: ignore[no-untyped-def]
+    """Write a network's actions ``wanted`` (P, 2) as the world takes them: one call costs less than its parts.
 
     That is the ``mean`` and ``chance`` (P, 2) standard deviations (2,); of those who see in a mirror, ``mirrored``
     (P,), what `shepherd_phys.mirror.meant` makes of it. Clipped to [-1, 1], as while learning, and to the unit disc, as
@@ -145,7 +148,6 @@ def _wanted(mean, chance, deviation, mirrored, offset, directions, rest, outside
     for others; ``limits`` are theirs: what is short for them in place of ``rest``, and how far inside the ring they may
     stand [m].
     """
-    wanted = np.empty(mean.shape)
     for p in range(len(mean)):
         x = mean[p, 0] + chance[p, 0] * deviation[0]
         y = mean[p, 1] + chance[p, 1] * deviation[1]
@@ -164,7 +166,6 @@ def _wanted(mean, chance, deviation, mirrored, offset, directions, rest, outside
         cos, sin = directions[0, offset[p]] / length, directions[1, offset[p]] / length
         wanted[p, 0] = cos * x - sin * y
         wanted[p, 1] = sin * x + cos * y
-    return wanted
 
 
 def load_policy(path: str | Path, classes: Iterable[Any] = ()) -> Policy:

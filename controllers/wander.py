@@ -65,26 +65,31 @@ class Wanderer:
             n = len(wanted)
             self._mean, self._way = wanted.copy(), np.zeros((n, 2))
             self._short, self._left = np.zeros(n, np.int64), np.zeros(n, np.int64)
-        if _wait(wanted, home, own.memory, own.least, own.after, self._mean, self._short, self._left):
+        done = wanted.copy()
+        if _wait(done, home, own.memory, own.least, own.after, self._mean, self._short, self._left, self._way):
             for p in np.flatnonzero((self._short >= own.after) & (self._left == 0)):
                 angle = self._rng.uniform(0.0, 2.0 * np.pi)
                 self._way[p] = np.cos(angle), np.sin(angle)
                 self._left[p] = self._rng.integers(own.shortest, own.longest, endpoint=True)
                 self._short[p] = 0
-        done = wanted.copy()
-        _walk(home, self._way, self._left, done)
+            _walk(home, self._way, self._left, done)
         return done
 
 
 @njit(cache=True, error_model="numpy")
-def _wait(wanted, home, memory, least, after, mean, short, left):  # type: ignore[no-untyped-def]
-    """Count for how many decisions the mean has been short; whether somebody is to begin a walk."""
+def _wait(done, home, memory, least, after, mean, short, left, way):  # type: ignore[no-untyped-def]
+    """Count for how many decisions the mean of what is wanted, ``done`` (P, 2), has been short.
+
+    Whether somebody is to begin a walk; if nobody is, those that are under way are written into ``done``.
+    """
     any_due = False
-    for p in range(len(wanted)):
-        mean[p, 0] += memory * (wanted[p, 0] - mean[p, 0])
-        mean[p, 1] += memory * (wanted[p, 1] - mean[p, 1])
+    for p in range(len(done)):
+        mean[p, 0] += memory * (done[p, 0] - mean[p, 0])
+        mean[p, 1] += memory * (done[p, 1] - mean[p, 1])
         short[p] = short[p] + 1 if math.hypot(mean[p, 0], mean[p, 1]) < least and not home[p] else 0
         any_due = any_due or (short[p] >= after and left[p] == 0)
+    if not any_due:
+        _walk(home, way, left, done)
     return any_due
 
 
