@@ -17,7 +17,17 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from shepherd_phys.layouts import Scattered
-from shepherd_phys.learning.folder import BEST, CURVE, POLICY, PRESET, VALIDATION, agree, begin
+from shepherd_phys.learning.folder import (
+    BEST,
+    CHECKPOINTS,
+    CURVE,
+    POLICY,
+    PRESET,
+    VALIDATION,
+    agree,
+    begin,
+    check_resumable,
+)
 from shepherd_phys.learning.preset import PRESETS, Preset, load_preset
 from shepherd_phys.learning.validation import scenarios
 from shepherd_phys.settings import SettingsError, kind_of
@@ -83,6 +93,9 @@ def main(argv: Sequence[str]) -> int:
         check_libraries()
         kinds = find_kinds(options.body, options.flock)
         folder, preset = prepare(options, flags, kinds)
+        anew = options.resume and not (folder / CHECKPOINTS).is_dir()
+        if anew:
+            check_resumable(folder, preset)
     except SettingsError as error:
         return fail(PROG, error, 2)
     # imported only now: torch takes seconds to load, which no mistake in the flags should cost
@@ -105,6 +118,8 @@ def main(argv: Sequence[str]) -> int:
         f"{preset.rollout_steps:,} shepherd-steps",
         file=sys.stderr,
     )
+    if anew:
+        print(f"no checkpoint yet, the first comes after {interval:,} shepherd-steps: it begins anew", file=sys.stderr)
     with progress_bar() as report:
         try:
             best = train(folder, options.workers, report, preset=preset, classes=handed(options, kinds))
@@ -118,7 +133,9 @@ def main(argv: Sequence[str]) -> int:
                 raise
             return fail(PROG, f"{explain(error)}, {', '.join(notes)}", 1)
         except KeyboardInterrupt:
-            return fail(PROG, f"stopped: --resume --out {folder} goes on from the last checkpoint", 130)
+            there = (folder / CHECKPOINTS).is_dir()
+            then = "goes on from the last checkpoint" if there else "begins anew: there is no checkpoint yet"
+            return fail(PROG, f"stopped: --resume --out {folder} {then}", 130)
     if best is not None:
         print(f"best policy: score {best.score:.1f} after {best.shepherd_steps:,} shepherd-steps")
     for name in (BEST, POLICY, CURVE, VALIDATION):
