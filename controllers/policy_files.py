@@ -179,13 +179,11 @@ def read_policy(
     table = _parsed(_read(path, MAX_JSON), path)
     try:
         spec = _spec(table, classes)
-        spec.network.shapes(spec.lidar)
+        size = _check_size(spec)
     except SettingsError as error:
         raise PolicyError(f"{path}: {_brief(str(error))}") from None
     except (TypeError, ValueError, OverflowError, RecursionError) as error:
         raise PolicyError(f"{path}: is not a policy ({_brief(str(error))})") from None
-    with _told_of(path):
-        size = _check_size(spec)
     beside = path.with_suffix(".safetensors")
     blob = _read(beside, size + HEADER)
     if hashlib.sha256(blob).hexdigest() != table["weights_sha256"]:

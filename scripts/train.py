@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from shepherd_phys.layouts import Scattered
+from shepherd_phys.learning import checkpoints
 from shepherd_phys.learning.folder import (
     BEST,
     CHECKPOINTS,
@@ -63,8 +64,7 @@ class Train:
     init: Annotated[str | None, flag("NAME|FILE", "the preset's")] = None
     """Policy to start from: a shipped one's name or a .json file."""
     scenario: Annotated[str | None, flag("NAME|FILE|module:Name", "the preset's")] = None
-    """Scenario, the only one then; where its flocks and obstacles are is its own, and not the preset's. Sizes of teams
-    and numbers of flocks stay the preset's; so does n where the preset draws it."""
+    """Scenario, the only one then: places of flocks and obstacles are its own, sizes of teams stay the preset's."""
     obstacles: Annotated[int | None, flag("COUNT", "the scenario's")] = None
     """Discs of radius 1 m, drawn anew for each episode: so many."""
     density: Annotated[float | None, flag("FRACTION", "the scenario's")] = None
@@ -93,7 +93,7 @@ def main(argv: Sequence[str]) -> int:
         check_libraries()
         kinds = find_kinds(options.body, options.flock)
         folder, preset = prepare(options, flags, kinds)
-        anew = options.resume and not (folder / CHECKPOINTS).is_dir()
+        anew = options.resume and not checkpoints.any_in(folder / CHECKPOINTS)
         if anew:
             check_resumable(folder, preset)
     except SettingsError as error:
@@ -133,7 +133,7 @@ def main(argv: Sequence[str]) -> int:
                 raise
             return fail(PROG, f"{explain(error)}, {', '.join(notes)}", 1)
         except KeyboardInterrupt:
-            there = (folder / CHECKPOINTS).is_dir()
+            there = checkpoints.any_in(folder / CHECKPOINTS)
             then = "goes on from the last checkpoint" if there else "begins anew: there is no checkpoint yet"
             return fail(PROG, f"stopped: --resume --out {folder} {then}", 130)
     if best is not None:

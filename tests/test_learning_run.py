@@ -1,6 +1,7 @@
 """Training runs: killed and resumed they equal the unbroken one; checkpoints are whole or not there."""
 
 import ast
+import contextlib
 import csv
 import os
 import shutil
@@ -400,6 +401,27 @@ def test_a_run_whose_checkpoints_are_gone_keeps_what_it_has_written(left, unbrok
     said = capsys.readouterr().err.splitlines()[-1]
     assert f"{tmp_path / 'run'}: holds 6 rollouts in curve.csv and no checkpoint to go on from" in said
     assert {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir() if path.is_file()} == before
+
+
+@pytest.mark.parametrize("stopped_in", [1, 3])
+def test_who_resumes_is_told_where_from(stopped_in, unbroken, tmp_path, monkeypatch, capsys):
+    """Of rollouts, two make a checkpoint."""
+    begin(tmp_path / "run", PRESET)
+    words = ["--resume", "--out", str(tmp_path / "run"), "--workers", "1"]
+
+    def stop(now):
+        if round(now.done * PRESET.n_rollouts) == stopped_in:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("shepherd_phys.scripts.train.progress_bar", lambda: contextlib.nullcontext(stop))
+        assert train_main(words) == 130
+    told = "goes on from the last checkpoint" if stopped_in > 2 else "begins anew: there is no checkpoint yet"
+    assert capsys.readouterr().err.splitlines()[-1].endswith(f"stopped: --resume --out {tmp_path / 'run'} {told}")
+    assert train_main(words) == 0
+    begun = "no checkpoint yet, the first comes after 240 shepherd-steps: it begins anew"
+    assert (begun in capsys.readouterr().err) == (stopped_in < 2)
+    assert_same_run(tmp_path / "run", unbroken)
 
 
 def test_a_run_goes_on_after_an_upgrade_that_knows_more_settings(unbroken, tmp_path):

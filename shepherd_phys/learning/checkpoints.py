@@ -85,6 +85,11 @@ def load_latest(folder: Path, before: int | None = None) -> Checkpoint | None:
     return None
 
 
+def any_in(folder: Path) -> bool:
+    """Whether a folder holds checkpoints, readable or not."""
+    return bool(_numbered(folder))
+
+
 def load(path: Path) -> Checkpoint:
     """Read one checkpoint.
 
